@@ -1,0 +1,282 @@
+"""The articulated body: pose and sizes in; rigid bodies, spheroids and joints in the camera's frame out.
+
+Left-camera frame (x right, y down, z forward); metres and radians. A pose has P = 24 parameters: the root's translation,
+its yaw, pitch and roll, then two per joint. A body's own frame is x to its left, y down, z out of its back.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from torchpose.body.skeleton import HUMAN, ROOT_AXES, Hinges, SizedVector, load_skeleton
+from torchpose.geometry import axis_pair_angles, exp_rotation, left_jacobian, rotation_between
+
+
+class JointKind(Enum):
+    """How two degrees of freedom turn a limb: two components of one rotation vector, or two hinges in a row."""
+
+    swing = "swing"
+    revolute = "revolute"
+
+
+@dataclass(frozen=True)
+class BodyConfig:
+    path: str = ""  # a body file; empty for the built-in human.yaml
+    joint: JointKind = JointKind.swing  # the thesis has revolute, which is singular at every straight limb
+
+
+@dataclass(frozen=True)
+class PosedBody:
+    """Where everything is, in the camera's frame."""
+
+    rotations: Float[Tensor, "batch bodies 3 3"]  # R_camera_body
+    origins: Float[Tensor, "batch bodies 3"]  # m, of the rigid bodies: the joint to the parent
+    centers: Float[Tensor, "batch parts 3"]  # m, of the spheroids
+    frames: Float[Tensor, "batch parts 3 3"]  # columns: the spheroids' axes, the long one last
+    radii: Float[Tensor, "batch parts 2"]  # m: across the long axis, and along it
+    joints: Float[Tensor, "batch joints 3"]  # m, in the order of `BodyModel.joint_names`
+    screw_axes: Float[Tensor, "batch parameters 3"]  # unit axis of each parameter
+    screw_origins: Float[Tensor, "batch parameters 3"]  # m, a point on it
+
+
+class BodyModel(nn.Module):
+    """Forward kinematics of a body file, differentiable in the pose and in the sizes.
+
+    The tree's tables (axes, limits, ancestors) are pytorch-kinematics' own, copied into buffers, and with
+    `joint=revolute` the result equals that library's. Geometry is linear in the sizes (B, S), 1 = the body file's.
+    """
+
+    axes: Tensor
+    low: Tensor
+    high: Tensor
+    moves: Tensor
+    rest: Tensor
+
+    def __init__(self, config: BodyConfig = BodyConfig()):
+        super().__init__()
+        self.config = config
+        self.skeleton = skeleton = load_skeleton(config.path or HUMAN)
+        self.parents = tuple(body.parent for body in skeleton.bodies)
+        self.body_names = skeleton.body_names
+        self.segment_names = tuple(segment.name for segment in skeleton.segments)
+        self.joint_names = tuple(joint.name for joint in skeleton.joints)
+        self.parameter_names = skeleton.parameter_names
+        self.size_names = skeleton.sizes
+        self.num_lengths = skeleton.num_lengths
+        self.segment_bodies = tuple(segment.body for segment in skeleton.segments)
+        self.joint_bodies = tuple(joint.body for joint in skeleton.joints)
+        self.levels = self._group_by_depth()
+        self._register_tree()
+        self._register_sizes()
+
+    @property
+    def num_parameters(self) -> int:
+        return len(self.parameter_names)
+
+    @property
+    def num_parts(self) -> int:
+        return len(self.segment_names)
+
+    def _group_by_depth(self) -> tuple[tuple[int, ...], ...]:
+        """Bodies of equal depth: one batched product each. Index 0 of `rotations` is the root."""
+        depth = [0]
+        for parent in self.parents:
+            depth.append(depth[parent] + 1)
+        return tuple(tuple(i for i, d in enumerate(depth) if d == level) for level in range(1, max(depth) + 1))
+
+    def _register_tree(self) -> None:
+        chain = self.skeleton.chain()
+        if tuple(chain.get_joint_parameter_names()) != self.parameter_names:
+            raise AssertionError("pytorch-kinematics orders the parameters otherwise than the skeleton")
+        swing = self.config.joint is JointKind.swing
+        hinges: list[Hinges] = [body.swing if swing else body.revolute for body in self.skeleton.bodies]
+        axes = torch.tensor([axis for hinge in hinges for axis in hinge.axes])
+        limits = torch.tensor([limit for hinge in hinges for limit in hinge.limits])
+        free = torch.full((6,), torch.inf)
+        # chain.axes has every axis by parameter; the swings replace those of the joints, not of the root.
+        self._constant("axes", torch.cat([chain.axes[:6], axes]))
+        self._constant("low", torch.cat([-free, limits[:, 0]]))
+        self._constant("high", torch.cat([free, limits[:, 1]]))
+        limbs = torch.tensor([body.limb for body in self.skeleton.bodies])
+        centers = torch.tensor([h.center or b.limb for h, b in zip(hinges, self.skeleton.bodies, strict=True)])
+        self._constant("limbs", limbs)
+        self._constant("centers", centers)
+        self._constant("align", exp_rotation(rotation_between(limbs.double(), centers.double())).to(limbs))
+        # moves[k, p]: parameter p moves body k. The library lists the frames from the base to each frame.
+        frames = chain.get_frame_names(exclude_fixed=False)
+        owner = {frame: joint for joint, frame in zip(self.parameter_names, frames[1:], strict=True)}
+        on_path = [
+            {owner[frames[i]] for i in chain.parents_indices[chain.frame_to_idx[name]].tolist() if i > 0}
+            for name in self.body_names
+        ]
+        moves = torch.tensor([[name in path for name in self.parameter_names] for path in on_path])
+        self.register_buffer("moves", moves, persistent=False)
+        rest = torch.tensor([body.rest for body in self.skeleton.bodies])[None]
+        zero = torch.zeros(1, 3)
+        self._constant("rest", self.pose_from_directions(zero, zero, self._rest_in_torso(rest))[0, 6:])
+
+    def _rest_in_torso(self, rest: Float[Tensor, "batch limbs 3"]) -> Float[Tensor, "batch limbs 3"]:
+        """Rest directions are stated in the parent's frame; a child's parent has itself turned."""
+        turn, directions = [torch.eye(3)[None]], []
+        for i, parent in enumerate(self.parents):
+            toward = rest[:, i]
+            directions.append((turn[parent] @ toward[..., None])[..., 0])
+            turn.append(turn[parent] @ self._turn(i, self._hinge_angles(i, toward)))
+        return torch.stack(directions, 1)
+
+    def _constant(self, name: str, value: Tensor) -> None:
+        self.register_buffer(name, value.float(), persistent=False)
+
+    def _register_sizes(self) -> None:
+        def basis(vectors: Sequence[SizedVector]) -> Tensor:
+            table = torch.zeros(len(vectors), 3, len(self.size_names))
+            for row, vector in enumerate(vectors):
+                for name, value in vector.terms:
+                    table[row, :, self.size_names.index(name)] += torch.tensor(value)
+            return table
+
+        skeleton = self.skeleton
+        self._constant("offset_basis", basis([body.origin for body in skeleton.bodies]))
+        self._constant("center_basis", basis([segment.center for segment in skeleton.segments]))
+        self._constant("joint_basis", basis([joint.at for joint in skeleton.joints]))
+        radii = torch.zeros(len(skeleton.segments), 2, len(self.size_names))
+        for row, segment in enumerate(skeleton.segments):
+            for column, (name, value) in enumerate((segment.radius, segment.half_length)):
+                radii[row, column, self.size_names.index(name)] = value
+        self._constant("radius_basis", radii)
+        long_axis = torch.tensor([segment.axis for segment in skeleton.segments])
+        up = torch.tensor([0.0, 0.0, 1.0]).expand_as(long_axis)
+        self._constant("segment_frames", exp_rotation(rotation_between(up.double(), long_axis.double())).float())
+
+    def default_size(self, batch: int) -> Float[Tensor, "batch sizes"]:
+        return torch.ones(batch, len(self.size_names), dtype=self.axes.dtype, device=self.axes.device)
+
+    def forward(
+        self, pose: Float[Tensor, "batch parameters"], size: Float[Tensor, "#batch sizes"] | None = None
+    ) -> PosedBody:
+        """Place the body. `size` (B or 1, S) multiplies the body file's lengths and girths; None is all ones."""
+        B = pose.shape[0]
+        if size is None:
+            size = self.default_size(1)
+        rotation, shift, axis, origin = self._joints(pose, size)
+        rotations: list[Tensor] = [rotation[:, 0]] + [pose] * len(self.parents)
+        origins: list[Tensor] = [pose[:, :3]] + [pose] * len(self.parents)
+        screw_axes: list[Tensor] = [axis[:, :6]] + [pose] * len(self.parents)
+        for level in self.levels:
+            above = [self.parents[i - 1] for i in level]
+            parent = torch.stack([rotations[i] for i in above], 1)  # (B, level, 3, 3)
+            turned = parent @ rotation[:, level]
+            moved = torch.stack([origins[i] for i in above], 1) + (parent @ shift[:, level, :, None])[..., 0]
+            across = parent[:, :, None] @ axis[:, 6:].unflatten(1, (-1, 2))[:, [i - 1 for i in level]][..., None]
+            for slot, i in enumerate(level):
+                rotations[i], origins[i], screw_axes[i] = turned[:, slot], moved[:, slot], across[:, slot, :, :, 0]
+        R, t = torch.stack(rotations, 1), torch.stack(origins, 1)
+        centers = t[:, self.segment_bodies] + _turned(R[:, self.segment_bodies], self.center_basis @ size[:, None, :, None])
+        joints = t[:, self.joint_bodies] + _turned(R[:, self.joint_bodies], self.joint_basis @ size[:, None, :, None])
+        radii = (self.radius_basis @ size[:, None, :, None])[..., 0].expand(B, -1, -1)
+        return PosedBody(
+            R,
+            t,
+            centers,
+            R[:, self.segment_bodies] @ self.segment_frames,
+            radii,
+            joints,
+            torch.cat(screw_axes, 1),
+            torch.cat([origin[:, :6], t[:, 1:].repeat_interleave(2, 1)], 1),
+        )
+
+    def _joints(
+        self, pose: Float[Tensor, "batch parameters"], size: Float[Tensor, "#batch sizes"]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Each body's rotation and shift in its parent's frame, and each parameter's axis there (root: camera's)."""
+        B = pose.shape[0]
+        yaw, pitch, roll = exp_rotation(self.axes[3:6] * pose[:, 3:6, None]).unbind(1)
+        turned = yaw @ pitch
+        eye = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(B, 3, 3)
+        root_axes = torch.cat([eye, yaw[:, :, 1:2].mT, yaw[:, :, 0:1].mT, turned[:, :, 2:3].mT], 1)
+        angles = pose[:, 6:].unflatten(1, (-1, 2))  # (B, J, 2)
+        axes = self.axes[6:].unflatten(0, (-1, 2))  # (J, 2, 3)
+        if self.config.joint is JointKind.swing:
+            vector = (angles[..., None] * axes).sum(2)
+            local = exp_rotation(vector) @ self.align
+            across = (left_jacobian(vector) @ axes.mT).mT  # (B, J, 2, 3)
+        else:
+            first, second = exp_rotation(angles[..., None] * axes).unbind(2)
+            local = first @ second
+            across = torch.stack([axes[:, 0].expand_as(first[..., 0]), (first @ axes[:, 1, :, None])[..., 0]], 2)
+        shift = (self.offset_basis @ size[:, None, :, None])[..., 0].expand(B, -1, -1)
+        rotation = torch.cat([(turned @ roll)[:, None], local], 1)
+        origin = pose[:, None, :3].expand(B, 6, 3)
+        return rotation, torch.cat([origin[:, :1], shift], 1), torch.cat([root_axes, across.flatten(1, 2)], 1), origin
+
+    def jacobian(
+        self, posed: PosedBody, points: Float[Tensor, "batch parts num 3"]
+    ) -> Float[Tensor, "batch parts num 3 parameters"]:
+        """Derivative of points fixed to the spheroids by the pose: `axis x (p - origin)`, zero off the path (App. E)."""
+        lever = points[..., None, :] - posed.screw_origins[:, None, None]
+        turning = torch.linalg.cross(posed.screw_axes[:, None, None].expand_as(lever), lever)
+        columns = torch.cat([posed.screw_axes[:, None, None, :3].expand_as(turning[..., :3, :]), turning[..., 3:, :]], -2)
+        return (columns * self.part_moves[:, None, :, None]).mT
+
+    @property
+    def part_moves(self) -> Bool[Tensor, "parts parameters"]:
+        """Which parameters move which spheroid."""
+        return self.moves[list(self.segment_bodies)]
+
+    def pose_from_directions(
+        self,
+        translation: Float[Tensor, "batch 3"],
+        root_angles: Float[Tensor, "batch 3"],
+        directions: Float[Tensor, "batch limbs 3"],
+    ) -> Float[Tensor, "batch parameters"]:
+        """The pose whose limbs point along `directions` (unit vectors in the torso's frame, bodies 1 to 9).
+
+        `root_angles` are yaw, pitch and roll, rad. A revolute joint that cannot reach a direction takes the nearest.
+        """
+        eye = torch.eye(3, dtype=directions.dtype, device=directions.device)
+        turn: list[Tensor] = [eye.expand(len(directions), 3, 3)]
+        angles = []
+        for i, parent in enumerate(self.parents):
+            toward = (turn[parent].mT @ directions[:, i, :, None])[..., 0]
+            angles.append(self._hinge_angles(i, toward))
+            turn.append(turn[parent] @ self._turn(i, angles[-1]))
+        return torch.cat([translation, root_angles, *angles], -1)
+
+    def _hinge_angles(self, joint: int, toward: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 2"]:
+        axes = self.axes[6 + 2 * joint : 8 + 2 * joint].to(toward)
+        if self.config.joint is JointKind.swing:
+            return rotation_between(self.centers[joint].to(toward).expand_as(toward), toward) @ axes.mT
+        both = axis_pair_angles(axes.expand(len(toward), 2, 3), self.limbs[joint].to(toward).expand_as(toward), toward)
+        low, high = (limit[6 + 2 * joint : 8 + 2 * joint].to(toward) for limit in (self.low, self.high))
+        # Of the two solutions the one within the limits, and of two such the one that turns less.
+        cost = (low - both).clamp_min(0).sum(-1) + (both - high).clamp_min(0).sum(-1) + 1e-3 * both.abs().sum(-1)
+        return both[torch.arange(len(both)), cost.argmin(-1)]
+
+    def _turn(self, joint: int, angles: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch 3 3"]:
+        axes = self.axes[6 + 2 * joint : 8 + 2 * joint].to(angles)
+        if self.config.joint is JointKind.swing:
+            return exp_rotation(angles @ axes) @ self.align[joint].to(angles)
+        return exp_rotation(angles[:, :1] * axes[0]) @ exp_rotation(angles[:, 1:] * axes[1])
+
+    def limb_directions(self, posed: PosedBody) -> Float[Tensor, "batch limbs 3"]:
+        """Unit directions of the nine limbs in the torso's frame: the inverse of `pose_from_directions`."""
+        return (posed.rotations[:, :1].mT @ _turned(posed.rotations[:, 1:], self.limbs[:, :, None])[..., None])[..., 0]
+
+
+def _turned(rotation: Tensor, column: Tensor) -> Tensor:
+    return (rotation @ column)[..., 0]
+
+
+def spheroid_matrix(posed: PosedBody) -> Float[Tensor, "batch parts 4 4"]:
+    """The homogeneous form A with `X^T A X = 2` on the surface (T. 3.3), in the camera's frame."""
+    a, c = posed.radii.unbind(-1)
+    D = torch.diag_embed(torch.stack([a, a, c], -1) ** -2)
+    A = posed.frames @ D @ posed.frames.mT
+    b = -(A @ posed.centers[..., None])
+    corner = (posed.centers[..., None, :] @ -b) + 1
+    return torch.cat([torch.cat([A, b], -1), torch.cat([b.mT, corner], -1)], -2)
+

@@ -1,0 +1,96 @@
+"""Rotations: the exponential map, its derivative and its inverse, minimal rotations and axis pairs.
+
+Rotation vectors are in radians; every function takes any number of leading batch axes, any device and any float dtype.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def hat(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The skew matrix with `hat(a) @ b = a x b`."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def _sinc_terms(theta2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 of t^2, smooth through zero."""
+    # Below 1e-2 the differences cancel; the series' first dropped term is then below 1e-16.
+    small = theta2 < 1e-4
+    # Both branches of `where` are differentiated, so the unused one must stay finite: hence 1.
+    safe2 = torch.where(small, 1.0, theta2)
+    safe = safe2.sqrt()
+    a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), safe.sin() / safe)
+    half = (safe / 2).sin()
+    b = torch.where(small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), 2 * half * half / safe2)
+    c = torch.where(small, 1 / 6 - theta2 / 120 * (1 - theta2 / 42 * (1 - theta2 / 72)), (safe - safe.sin()) / (safe2 * safe))
+    return a, b, c
+
+
+def exp_rotation(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of a rotation vector (Rodrigues' formula), differentiable everywhere."""
+    a, b, _ = _sinc_terms((vector * vector).sum(-1))
+    skew = hat(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + a[..., None, None] * skew + b[..., None, None] * (skew @ skew)
+
+
+def left_jacobian(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The matrix J with `d exp(v) = hat(J dv) exp(v)`: column k is the axis about which v_k turns."""
+    _, b, c = _sinc_terms((vector * vector).sum(-1))
+    skew = hat(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + b[..., None, None] * skew + c[..., None, None] * (skew @ skew)
+
+
+def rotation_between(
+    start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector of the smallest rotation that turns the unit vector `start` into `end`.
+
+    Opposite vectors leave the axis undefined; an axis across `start` is then taken.
+    """
+    axis = torch.linalg.cross(start, end)
+    sine = axis.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (start * end).sum(-1, keepdim=True))
+    # The unit vector furthest from `start` is never parallel to it.
+    least = torch.nn.functional.one_hot(start.abs().argmin(-1), 3).to(start)
+    across = torch.nn.functional.normalize(torch.linalg.cross(start, least), dim=-1)
+    tiny = torch.finfo(start.dtype).eps
+    return torch.where(sine > tiny, axis / sine.clamp_min(tiny), across) * angle
+
+
+def angle_between(first: Float[Tensor, "*batch 3"], second: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """Angle between two vectors of any length, rad in [0, pi]; exact near 0 and pi, where arccos is not."""
+    cross = torch.linalg.cross(first, second).norm(dim=-1)
+    return torch.atan2(cross, (first * second).sum(-1))
+
+
+def axis_pair_angles(
+    axes: Float[Tensor, "*batch 2 3"], start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 2 2"]:
+    """Both pairs (t1, t2) with `exp(axis_1 t1) exp(axis_2 t2) start = end` (Paden and Kahan's second problem).
+
+    The axes are unit vectors at a right angle to each other. Where `end` cannot be reached, the nearest
+    direction that can is taken. Returns angles in radians, one solution per row of the second last axis.
+    """
+    first, second = axes.unbind(-2)
+    third = torch.linalg.cross(first, second)
+    # In the frame (first, second, third): turning about `second` must bring start's part along `first` to end's.
+    along = (first * end).sum(-1)
+    level = (first * start).sum(-1)
+    side = (third * start).sum(-1)
+    radius = torch.hypot(level, side)
+    base = torch.atan2(side, level)  # start's direction in the (first, third) plane
+    bend = torch.acos((along / radius.clamp_min(torch.finfo(end.dtype).tiny)).clamp(-1, 1))
+    middle = (second * start).sum(-1)
+    solutions = []
+    for sign in (1.0, -1.0):
+        t2 = base - sign * bend  # a turn by t2 about `second` takes angle `base` to `base - t2`
+        rest = radius * torch.sin(base - t2)  # what then lies along `third`
+        t1 = torch.atan2((third * end).sum(-1), (second * end).sum(-1)) - torch.atan2(rest, middle)
+        solutions.append(torch.stack([t1, t2], -1))
+    both = torch.stack(solutions, -2)
+    return torch.remainder(both + torch.pi, 2 * torch.pi) - torch.pi
