@@ -1,0 +1,50 @@
+# `make demo` and `make test` are all that a fresh machine with Python 3.11, 3.12 or 3.13 needs.
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+PIP_INSTALL := $(PYTHON) -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Two threads on two busy cores can be many times slower than one.
+export OMP_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-slow clean
+
+help:  ## say what there is
+	@sed -n 's/^\([a-z-]*\):.*  ## /  make \1\t/p' Makefile | expand -t 20
+
+install: $(VENV)/install.stamp  ## make .venv and install torchpose into it; quick when nothing changed
+
+demo: install  ## install, then recover the poses from a recording that the package makes itself
+	$(PYTHON) infer.py output=runs/demo
+	@echo "The results are in $(CURDIR)/runs/demo: poses.csv, overlay.mp4, angles.png and more."
+
+test: $(VENV)/test.stamp  ## install, then lint, types and the fast tests
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/pytest -q -n 2
+
+test-slow: $(VENV)/test.stamp  ## install, then the tests that take longer
+	$(VENV)/bin/pytest -q -m slow
+
+clean:  ## remove .venv and everything that installing, testing and running leave behind
+	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamps are newer than what they were made from, so make has nothing to do the second time.
+$(PYTHON):
+	@python=""; for name in python3.11 python3 python3.12 python3.13; do \
+	  if $$name -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null; \
+	  then python=$$name; break; fi; done; \
+	if [ -z "$$python" ]; then \
+	  echo "torchpose needs Python 3.11, 3.12 or 3.13, and found none; install one, so that python3 starts it" >&2; \
+	  exit 1; fi; \
+	"$$python" -m venv $(VENV)
+
+$(VENV)/install.stamp: pyproject.toml constraints.txt | $(PYTHON)
+	$(PIP_INSTALL) -e .
+	@touch $@
+
+$(VENV)/test.stamp: $(VENV)/install.stamp
+	$(PIP_INSTALL) -e '.[test]'
+	@touch $@
