@@ -1,4 +1,4 @@
-"""The order of the house: a file imports only from rooms before its own, and in its room from files before it."""
+"""The order of the house: a file imports only from rooms, and in its room from files, before its own."""
 
 import ast
 from collections.abc import Iterator
@@ -8,8 +8,8 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "torchpose"
 
-# The rooms in the order in which data flows through them, and the files of each in the order in which they may
-# import one another. A new file takes its place here first.
+# The rooms in the order in which data flows through them, and the files of each in the order in which they
+# may import one another. A new file takes its place here first.
 ROOMS: dict[str, tuple[str, ...]] = {
     "": ("atomic", "geometry", "least_squares"),
     "vision": ("camera", "stereo", "background", "points", "faces"),
@@ -19,7 +19,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "activity": ("features", "codebook", "hmm", "recognizer", "diary"),
     "synthesis": ("motion", "render", "database"),
     "learning": ("part_network", "training"),
-    "the house's": ("recording", "export", "figures", "pipeline", "cli"),
+    "the house's": ("calibration", "recording", "export", "figures", "pipeline", "cli"),
 }
 ORDER = [
     f"torchpose.{room}.{file}" if (PACKAGE / room).is_dir() and room else f"torchpose.{file}"

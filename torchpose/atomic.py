@@ -8,7 +8,7 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, with its suffix; it takes that place when the block ends without an error.
+    """A temporary path beside `path`, with its suffix; renamed to `path` when the block ends without error.
 
     After an error, or an interruption, the temporary file is removed and what stood at `path` still stands.
     The folder is made if need be.
