@@ -107,10 +107,11 @@ class BodyModel(nn.Module):
         self._constant("centers", centers)
         self._constant("align", exp_rotation(rotation_between(limbs.double(), centers.double())).to(limbs))
         # moves[k, p]: parameter p moves body k. The library lists the frames from the base to each frame.
-        frames = chain.get_frame_names(exclude_fixed=False)
-        owner = {frame: joint for joint, frame in zip(self.parameter_names, frames[1:], strict=True)}
         on_path = [
-            {owner[frames[i]] for i in chain.parents_indices[chain.frame_to_idx[name]].tolist() if i > 0}
+            {
+                chain.find_frame(chain.idx_to_frame[i]).joint.name
+                for i in chain.parents_indices[chain.frame_to_idx[name]].tolist()
+            }
             for name in self.body_names
         ]
         moves = torch.tensor([[name in path for name in self.parameter_names] for path in on_path])

@@ -1,0 +1,137 @@
+"""Levenberg-Marquardt for a batch of independent nonlinear least-squares problems, with a status for each.
+
+It takes a callable and knows nothing of bodies or cameras.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+Residual = Callable[[Float[Tensor, "batch unknowns"]], Float[Tensor, "batch residuals"]]
+Linearize = Callable[
+    [Float[Tensor, "batch unknowns"]],
+    tuple[Float[Tensor, "batch residuals"], Float[Tensor, "batch residuals unknowns"]],
+]
+
+
+class Status(IntEnum):
+    """What became of a problem."""
+
+    CONVERGED = 0  # the step or the fall of the loss became smaller than its tolerance
+    MAX_STEPS = 1  # out of steps: a longer run may still improve it
+    NON_FINITE = 2  # residuals or Jacobian were not finite at the start; x is returned as given
+
+
+@dataclass(frozen=True)
+class LMConfig:
+    max_steps: int = 20
+    damping: float = 1e-3  # lambda at the start, relative to the diagonal; much less ends in flipped poses
+    step_tolerance: float = 1e-6  # stop when no unknown moves further
+    loss_tolerance: float = 1e-9  # stop when the loss falls by a smaller share
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, got {self.max_steps}")
+        if not self.damping > 0:
+            raise ValueError(f"damping must be positive, got {self.damping}; 1e-3 suits most problems")
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The answer to each problem of the batch."""
+
+    value: Float[Tensor, "batch unknowns"]
+    loss: Float[Tensor, " batch"]  # half the sum of squares at `value`
+    normal: Float[Tensor, "batch unknowns unknowns"]  # J^T J at the last point that was linearised
+    status: Int[Tensor, " batch"]
+    steps: Int[Tensor, " batch"]
+
+
+def levenberg_marquardt(
+    linearize: Linearize, start: Float[Tensor, "batch unknowns"], config: LMConfig = LMConfig()
+) -> Solution:
+    """Minimise |r(x)|^2 / 2 for each row of `start` on its own.
+
+    Each step solves (J^T J + lambda diag(J^T J)) d = -J^T r. A step that lowers the loss is kept and lambda falls
+    tenfold; otherwise x stays and lambda rises tenfold. So the loss never rises, and a row that is not finite, or has
+    converged, changes neither itself nor its neighbours.
+
+    Args:
+        linearize: maps x (B, P) to residuals r (B, M) and their Jacobian (B, M, P).
+        start: first guess, a problem a row.
+    """
+    x = start
+    residual, jacobian = linearize(x)
+    loss = _loss(residual)
+    broken = ~(loss.isfinite() & jacobian.flatten(1).isfinite().all(1))
+    active = ~broken
+    status = torch.where(broken, int(Status.NON_FINITE), int(Status.MAX_STEPS))
+    steps = torch.zeros_like(status)
+    damping = torch.full_like(loss, config.damping)
+    normal, gradient = _normal_equations(residual, jacobian)
+    normal = torch.where(broken[:, None, None], 0.0, normal)
+    for _ in range(config.max_steps):
+        step, solved = _solve(normal, gradient, damping)
+        trial = torch.where(active[:, None], x + step, x)
+        residual, jacobian = linearize(trial)
+        trial_loss = _loss(residual)
+        better = active & (trial_loss < loss)  # False where the trial is not finite
+        fall = loss - trial_loss
+        done = better & ((step.abs().amax(1) < config.step_tolerance) | (fall <= config.loss_tolerance * loss))
+        # A rejected step this small means that the loss cannot be resolved any further.
+        done |= active & solved & ~better & (step.abs().amax(1) < config.step_tolerance)
+        x = torch.where(better[:, None], trial, x)
+        loss = torch.where(better, trial_loss, loss)
+        new_normal, new_gradient = _normal_equations(residual, jacobian)
+        normal = torch.where(better[:, None, None], new_normal, normal)
+        gradient = torch.where(better[:, None], new_gradient, gradient)
+        damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
+        steps = steps + active
+        status = torch.where(done, int(Status.CONVERGED), status)
+        active = active & ~done
+        if not bool(active.any()):
+            break
+    return Solution(x, loss, normal, status, steps)
+
+
+def linearize_by_autograd(residual: Residual) -> Linearize:
+    """Residuals and Jacobian of a residual function by forward-mode differentiation: the reference for every other.
+
+    Row b of the residuals may depend on row b of x alone. The columns are pushed through together, as one batch of
+    B x P tangents, which keeps the batch axis where the function expects it.
+    """
+
+    def linearize(x: Tensor) -> tuple[Tensor, Tensor]:
+        B, P = x.shape
+        tangents = torch.eye(P, dtype=x.dtype, device=x.device)[:, None].expand(P, B, P)
+
+        def push(tangent: Tensor) -> Tensor:
+            return torch.func.jvp(residual, (x,), (tangent,))[1]
+
+        columns = torch.func.vmap(push)(tangents)  # (P, B, M)
+        return residual(x), columns.permute(1, 2, 0)
+
+    return linearize
+
+
+def _loss(residual: Tensor) -> Tensor:
+    return 0.5 * (residual * residual).sum(1)
+
+
+def _normal_equations(residual: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
+    return jacobian.mT @ jacobian, (jacobian.mT @ residual[..., None])[..., 0]
+
+
+def _solve(normal: Tensor, gradient: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """The damped Gauss-Newton step, and where there is one: elsewhere it is zero, so that lambda rises."""
+    diagonal = normal.diagonal(dim1=1, dim2=2)
+    # An unknown that nothing depends on has a zero diagonal; the floor keeps its step at zero, not at NaN.
+    floor = diagonal.amax(1, keepdim=True) * torch.finfo(normal.dtype).eps + torch.finfo(normal.dtype).tiny
+    factor, failed = torch.linalg.cholesky_ex(normal + torch.diag_embed(damping[:, None] * diagonal + floor))
+    step = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+    solved = (failed == 0) & step.isfinite().all(1)
+    return torch.where(solved[:, None], step, 0.0), solved

@@ -1,0 +1,1 @@
+"""Registration of the body to a point cloud by variational expectation maximisation."""

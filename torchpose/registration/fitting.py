@@ -1,0 +1,138 @@
+"""The M-step: the pose that brings the body's points to their targets, by Levenberg-Marquardt (T. 3.24, App. E).
+
+Every measurement is a row: a point fixed to a part, a target in the camera's frame and a direction along which their
+difference counts. Metres; a direction is divided by the row's standard deviation, so residuals have no unit.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose.body.model import BodyModel, PosedBody
+from torchpose.least_squares import (
+    Linearize,
+    LMConfig,
+    Residual,
+    Solution,
+    levenberg_marquardt,
+    linearize_by_autograd,
+)
+
+
+class JacobianKind(Enum):
+    """Two ways to the same matrix: `autograd` is the reference, `geometric` the closed form of App. E."""
+
+    autograd = "autograd"
+    geometric = "geometric"
+
+
+@dataclass(frozen=True)
+class FittingConfig:
+    jacobian: JacobianKind = JacobianKind.geometric
+    lm: LMConfig = LMConfig(max_steps=2)  # per round; correspondences are renewed in between
+    limit_sd: float = 0.05  # rad beyond a joint's limit that cost as much as one sigma; 0 switches limits off
+
+    def __post_init__(self) -> None:
+        if self.limit_sd < 0:
+            raise ValueError(f"limit_sd must not be negative, got {self.limit_sd}; 0 switches the limits off")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Linear measurements of points that are fixed to parts; a zero direction is an empty row."""
+
+    part: Int[Tensor, "batch rows"]
+    local: Float[Tensor, "batch rows 3"]  # m, the model's point in its part's frame
+    target: Float[Tensor, "batch rows 3"]  # m, camera's frame
+    direction: Float[Tensor, "batch rows 3"]  # 1/m, camera's frame: unit direction / standard deviation
+
+    @staticmethod
+    def cat(*rows: "Rows") -> "Rows":
+        return Rows(*(torch.cat([getattr(r, name) for r in rows], 1) for name in Rows.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """A Gaussian on the pose parameters, independent ones: precision 0 says nothing."""
+
+    mean: Float[Tensor, "batch parameters"]
+    precision: Float[Tensor, "batch parameters"]
+
+
+def fit_pose(
+    body: BodyModel,
+    start: Float[Tensor, "batch parameters"],
+    size: Float[Tensor, "#batch sizes"],
+    rows: Rows,
+    prior: PosePrior,
+    config: FittingConfig,
+) -> Solution:
+    """The pose that minimises the rows' squares, the prior's and those of broken limits, from `start`."""
+    residual = pose_residual(body, size, rows, prior, config)
+    if config.jacobian is JacobianKind.autograd:
+        linearize = linearize_by_autograd(residual)
+    else:
+        linearize = linearize_by_screws(body, size, rows, prior, config)
+    return levenberg_marquardt(linearize, start, config.lm)
+
+
+def pose_residual(
+    body: BodyModel, size: Float[Tensor, "#batch sizes"], rows: Rows, prior: PosePrior, config: FittingConfig
+) -> Residual:
+    """All residuals as a function of the pose: rows, prior, limits."""
+
+    def residual(pose: Tensor) -> Tensor:
+        posed = body(pose, size)
+        gap = rows.target - model_points(posed, rows)
+        return torch.cat([(rows.direction * gap).sum(-1), *_pose_terms(body, pose, prior, config)], 1)
+
+    return residual
+
+
+def linearize_by_screws(
+    body: BodyModel, size: Float[Tensor, "#batch sizes"], rows: Rows, prior: PosePrior, config: FittingConfig
+) -> Linearize:
+    """The same residuals with their Jacobian in closed form: a row of it is (p x n, n) against each joint's screw.
+
+    With the screw S = (w, o x w) of an axis w through o, n . (w x (p - o)) = (p x n, n) . S; a translation along w is
+    the screw (0, w). One product serves all rows and joints; rows of parts that a joint does not move are masked.
+    """
+    moves = body.part_moves.to(rows.direction)[rows.part]  # (B, R, P)
+    slope = prior.precision.sqrt()
+
+    def linearize(pose: Tensor) -> tuple[Tensor, Tensor]:
+        posed = body(pose, size)
+        points = model_points(posed, rows)
+        wrench = torch.cat([torch.linalg.cross(points, rows.direction), rows.direction], -1)
+        turning = torch.cat([posed.screw_axes, torch.linalg.cross(posed.screw_origins, posed.screw_axes)], -1)
+        sliding = torch.cat([torch.zeros_like(posed.screw_axes), posed.screw_axes], -1)
+        screws = torch.cat([sliding[:, :3], turning[:, 3:]], 1)
+        residual = torch.cat(
+            [(rows.direction * (rows.target - points)).sum(-1), *_pose_terms(body, pose, prior, config)], 1
+        )
+        jacobian = [-(wrench @ screws.mT) * moves, torch.diag_embed(slope)]
+        if config.limit_sd > 0:
+            outside = (pose < body.low) | (pose > body.high)
+            jacobian.append(torch.diag_embed(outside.to(pose) / config.limit_sd))
+        return residual, torch.cat(jacobian, 1)
+
+    return linearize
+
+
+def model_points(posed: PosedBody, rows: Rows) -> Float[Tensor, "batch rows 3"]:
+    """The rows' model points in the camera's frame, m."""
+    index = rows.part[..., None]
+    frames = posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3))
+    centers = posed.centers.gather(1, index.expand(-1, -1, 3))
+    return (frames @ rows.local[..., None])[..., 0] + centers
+
+
+def _pose_terms(body: BodyModel, pose: Tensor, prior: PosePrior, config: FittingConfig) -> list[Tensor]:
+    terms = [prior.precision.sqrt() * (pose - prior.mean)]
+    if config.limit_sd > 0:
+        over = (pose - body.high).clamp_min(0) - (body.low - pose).clamp_min(0)
+        terms.append(over / config.limit_sd)
+    return terms

@@ -1,0 +1,96 @@
+"""The silhouette as a measurement of the pose: no part of the body shows where the background is seen.
+
+Left-camera frame, metres; pixels (u, v).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.body.ellipsoid import outline, to_camera
+from torchpose.body.model import PosedBody
+from torchpose.registration.fitting import Rows
+from torchpose.vision.camera import StereoCamera
+
+
+@dataclass(frozen=True)
+class SilhouetteConfig:
+    weight: float = 1.0  # of the whole term against the points; 0 switches it off
+    sd: float = 0.02  # m, by which a rim may stand out of the mask
+    rim_points: int = 12  # per part
+    reach: float = 0.25  # m, no stronger pull than from here, so that a mask with a missing limb cannot tear one off
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or not self.sd > 0 or self.rim_points < 3 or not self.reach > 0:
+            raise ValueError(f"weight >= 0, sd > 0, rim_points >= 3 and reach > 0 must hold, got {self}")
+
+
+def nearest_inside(mask: Bool[Tensor, "batch height width"]) -> Float[Tensor, "batch height width 2"]:
+    """The nearest pixel (u, v) of the mask to each pixel; each pixel itself where a mask is empty.
+
+    OpenCV's exact labels: kornia's distance transform is up to 49 px off.
+    """
+    B, H, W = mask.shape
+    grid = torch.stack(torch.meshgrid(torch.arange(W), torch.arange(H), indexing="xy"), -1).numpy()
+    nearest = []
+    for inside in mask.cpu().numpy():
+        if not inside.any():
+            nearest.append(grid)
+            continue
+        _, label = cv2.distanceTransformWithLabels(
+            (~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        source = np.zeros((label.max() + 1, 2), grid.dtype)
+        source[label[inside]] = grid[inside]
+        nearest.append(source[label])
+    return torch.from_numpy(np.stack(nearest)).to(mask.device, torch.get_default_dtype())
+
+
+def silhouette_rows(
+    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: SilhouetteConfig
+) -> Rows:
+    """A row for each rim point of each part: where it projects beside the mask, it is drawn to the mask's edge.
+
+    `nearest` comes from `nearest_inside`. Points outside the image or within a pixel of the mask give empty rows.
+    """
+    B, K = posed.centers.shape[:2]
+    points = outline(posed, config.rim_points)
+    local = (points - posed.centers[:, :, None]) @ posed.frames
+    points, local = points.flatten(1, 2), local.flatten(1, 2)
+    part = torch.arange(K, device=points.device).repeat_interleave(config.rim_points).expand(B, -1)
+    depth = points[..., 2].clamp_min(0.1)
+    pixel = camera.project(torch.cat([points[..., :2], depth[..., None]], -1))
+    H, W = nearest.shape[1:3]
+    edge = torch.tensor([W - 1, H - 1], dtype=pixel.dtype, device=pixel.device)
+    seen = ((pixel > 0) & (pixel < edge)).all(-1)
+    index = pixel.detach().round().clamp(min=torch.zeros_like(edge), max=edge).long()
+    flat = (index[..., 1] * W + index[..., 0])[..., None].expand(-1, -1, 2)
+    goal = nearest.flatten(1, 2).expand(B, -1, -1).gather(1, flat).to(points)
+    gap = pixel - goal
+    length = gap.norm(dim=-1)
+    unit = gap / length.clamp_min(1e-6)[..., None]
+    outside = seen & (length > 1)
+    # Along the ray the rim may move freely: the direction is that of the image plane, across the ray.
+    across = torch.cat([unit, -(unit * points[..., :2]).sum(-1, keepdim=True) / depth[..., None]], -1)
+    metres = length * depth / camera.focal_length
+    pull = (config.reach / metres.clamp_min(config.reach)) * (config.weight**0.5 / config.sd)
+    return Rows(part, local, camera.back_project(goal, depth), across * (outside * pull)[..., None])
+
+
+def overhang(
+    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: SilhouetteConfig
+) -> Float[Tensor, " batch"]:
+    """How far the body's rims stand out of the mask, m: the mean over the rim points, each at most `reach`."""
+    rows = silhouette_rows(posed, nearest, camera, config)
+    gap = (rows.direction * (rows.target - _points(posed, rows))).sum(-1).abs()
+    metres = gap * config.sd / max(config.weight, 1e-12) ** 0.5
+    return metres.clamp_max(config.reach).mean(1)
+
+
+def _points(posed: PosedBody, rows: Rows) -> Tensor:
+    B, K = posed.centers.shape[:2]
+    return to_camera(posed, rows.local.unflatten(1, (K, -1))).flatten(1, 2)

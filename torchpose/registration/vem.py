@@ -1,0 +1,252 @@
+"""Registration by variational EM: label the points (VE-step), fit the body (M-step), until the pose stands (T. 3.2.2).
+
+Left-camera frame; metres and radians. A batch holds frames, or several starts of one frame: evidence of batch 1 is
+shared by all rows.
+"""
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchpose.body.ellipsoid import FootPoint, algebraic_distance, foot_point
+from torchpose.body.model import BodyModel, PosedBody
+from torchpose.least_squares import Status
+from torchpose.registration.fitting import FittingConfig, PosePrior, Rows, fit_pose, linearize_by_screws
+from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
+from torchpose.registration.silhouette import SilhouetteConfig, overhang, silhouette_rows
+from torchpose.vision.camera import StereoCamera
+from torchpose.vision.points import PointCloud
+
+
+class Distance(Enum):
+    """What the labels are judged by: metres to the surface, or the cheaper and biased q(X) of (3.3)."""
+
+    euclidean = "euclidean"
+    algebraic = "algebraic"
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    rounds: int = 5  # VE-steps, each followed by an M-step
+    sigma_first: float = 0.10  # m, of the reconstruction term (3.13) in the first round
+    sigma_last: float = 0.03  # m, in the last; in between it falls geometrically
+    distance: Distance = Distance.euclidean
+    visible: bool = True  # correspond with the side that the camera sees
+    outlier: float = 3.0  # sigmas beyond which a point rather has no part; 0 gives every point a part
+    hard: bool = True  # each point answers to its best label alone; soft costs 14 times the rows and gains nothing
+    tangential: float = 0.3  # weight of the residual along the surface; 1 is the Euclidean distance to a fixed foot
+    robust_sd: float = 0.05  # m, at which a residual loses three quarters of its weight; 0 weighs all alike
+    noise_sd: float = 0.02  # m, of a point in the M-step
+    effective_points: float = 150.0  # what the correlated points are worth as independent ones
+    rest_sd: float = 0.5  # rad, of the pull towards the rest pose on joints that nothing is seen of; 0 is none
+    rest_support: float = 5.0  # points on a limb that halve this pull
+    labelling: LabellingConfig = field(default_factory=LabellingConfig)
+    fitting: FittingConfig = field(default_factory=FittingConfig)
+    silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise ValueError(f"rounds must be at least 1, got {self.rounds}")
+        for name in ("sigma_first", "sigma_last", "noise_sd", "effective_points", "rest_support"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("outlier", "robust_sd", "rest_sd", "tangential"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A frame as registration sees it. Batch 1 serves any number of starts."""
+
+    cloud: PointCloud
+    potential: Float[Tensor, "batch num parts"]  # log-potentials of the appearance terms
+    nearest: Float[Tensor, "batch height width 2"]  # `nearest_inside` of the silhouette
+    camera: StereoCamera
+    geodesic: GeodesicTerm | None = None
+
+    def expand(self, batch: int) -> "Observation":
+        """The same observation for `batch` starts, without a copy."""
+        cloud = PointCloud(*(_rows(getattr(self.cloud, name), batch) for name in PointCloud.__dataclass_fields__))
+        geodesic = self.geodesic
+        if geodesic is not None:
+            geodesic = GeodesicTerm(
+                _rows(geodesic.cell, batch),
+                _rows(geodesic.distance, batch),
+                geodesic.shortest,
+                geodesic.longest,
+                geodesic.most,
+            )
+        return Observation(cloud, _rows(self.potential, batch), self.nearest, self.camera, geodesic)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The fitted poses and what speaks for them."""
+
+    pose: Float[Tensor, "batch parameters"]
+    covariance: Float[Tensor, "batch parameters parameters"]  # of the pose, from rows, prior and limits (Laplace)
+    belief: Float[Tensor, "batch labels num"]  # q(label) of each point; the last label is "no part" where there is one
+    distance: Float[Tensor, "batch num"]  # m, to the nearest part; 0 on padding
+    point_to_model: Float[Tensor, " batch"]  # m, (5.2): the mean of `distance` over the points
+    misfit: Float[Tensor, " batch"]  # m, capped distance of the points plus overhang: compares starts
+    bound: Float[Tensor, "rounds batch"]  # (C.8) after each VE-step, at that round's sigma
+    status: Int[Tensor, " batch"]  # of the last M-step, see `Status`
+
+
+class Registrar(nn.Module):
+    """Fits a body to observations from given starts. Everything it knows of a person comes as arguments."""
+
+    def __init__(self, body: BodyModel, config: RegistrationConfig = RegistrationConfig()):
+        super().__init__()
+        self.body = body
+        self.config = config
+
+    def forward(
+        self,
+        observation: Observation,
+        start: Float[Tensor, "batch parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior | None = None,
+        rounds: int | None = None,
+        sigma_first: float | None = None,
+    ) -> Registration:
+        """Register from `start`. A row that is not finite keeps its start, with status NON_FINITE.
+
+        Args:
+            prior: what earlier frames say of the pose; None says nothing.
+            rounds, sigma_first: override the config, for a cold start.
+        """
+        config, B = self.config, start.shape[0]
+        observation = observation.expand(B)
+        if prior is None:
+            prior = PosePrior(start, torch.zeros_like(start))
+        rounds = rounds or config.rounds
+        sigma_first = sigma_first or config.sigma_first
+        pose, bounds = start, []
+        status = torch.full((B,), int(Status.MAX_STEPS), device=start.device)
+        for i in range(rounds):
+            share = i / max(rounds - 1, 1)
+            sigma = sigma_first ** (1 - share) * config.sigma_last**share
+            posed = self.body(pose, size)
+            foot = foot_point(posed, observation.cloud.points, config.visible)
+            labelling = self.label(posed, foot, observation, sigma)
+            bounds.append(labelling.bound[-1])
+            rows, support = self.rows(posed, foot, labelling, observation)
+            full = self._with_rest(prior, support)
+            solution = fit_pose(self.body, pose, size, rows, full, config.fitting)
+            pose, status = solution.value, solution.status
+        return self._result(observation, pose, size, prior, torch.stack(bounds), status)
+
+    def label(self, posed: PosedBody, foot: FootPoint, observation: Observation, sigma: float) -> Labelling:
+        """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled."""
+        if self.config.distance is Distance.algebraic:
+            square = algebraic_distance(posed, observation.cloud.points) ** 2
+        else:
+            square = (foot.residual**2).sum(-1)
+        potential = observation.potential.mT - square / (2 * sigma**2)
+        if self.config.outlier > 0:
+            none = torch.full_like(potential[:, :1], -0.5 * self.config.outlier**2)
+            potential = torch.cat([potential, none], 1)
+        cloud = observation.cloud
+        return mean_field(
+            potential, cloud.neighbours, cloud.mask, self.config.labelling, cloud.grid, observation.geodesic
+        )
+
+    def rows(
+        self, posed: PosedBody, foot: FootPoint, labelling: Labelling, observation: Observation
+    ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
+        """The M-step's rows from beliefs, and how many points support each part."""
+        belief = labelling.belief[:, : self.body.num_parts]
+        if self.config.hard:
+            best = labelling.belief.argmax(1, keepdim=True)
+            belief = torch.zeros_like(labelling.belief).scatter(1, best, 1.0)[:, : self.body.num_parts]
+            belief = belief * observation.cloud.mask[:, None]
+        rows = self._point_rows(posed, foot, belief, observation.cloud)
+        if self.config.silhouette.weight > 0:
+            across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.silhouette)
+            # Rims of one part move together, so they count as a few independent measurements, not as many.
+            rows = Rows.cat(rows, across)
+        return rows, belief.sum(2)
+
+    def _point_rows(
+        self, posed: PosedBody, foot: FootPoint, belief: Float[Tensor, "batch parts num"], cloud: PointCloud
+    ) -> Rows:
+        config = self.config
+        count = cloud.mask.sum(1).clamp_min(1)
+        weight = belief * (config.effective_points / count).clamp_max(1)[:, None, None]
+        if config.robust_sd > 0:  # Geman and McClure
+            weight = weight / (1 + (foot.residual**2).sum(-1) / config.robust_sd**2) ** 2
+        normal, residual, local = foot.normal, foot.residual, foot.local
+        part = torch.arange(belief.shape[1], device=belief.device)[None, :, None].expand_as(belief)
+        target = cloud.points[:, None].expand_as(local)
+        if config.hard:
+            best = belief.argmax(1)
+            pick = best[:, None]
+            weight, part = weight.gather(1, pick), pick
+            wide = pick[..., None].expand(-1, -1, -1, 3)
+            normal, residual, local = (x.gather(1, wide) for x in (normal, residual, local))
+            target = target[:, :1]
+        frames = posed.frames.flatten(2).gather(1, part.flatten(1)[..., None].expand(-1, -1, 9)).unflatten(2, (3, 3))
+        normal = (frames @ normal.flatten(1, 2)[..., None])[..., 0]
+        scale = weight.flatten(1).sqrt() / config.noise_sd
+        # Along the normal the distance counts in full. Along the surface it does so only as far as asked, which lets
+        # a limb slide to where it fits, except for points behind the rim, whose way along the ray counts too.
+        eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+        outer = normal[..., :, None] * normal[..., None, :]
+        spread = outer + config.tangential * (eye - outer)  # (B, rows, 3, 3), symmetric
+        direction = (scale[..., None, None] * spread).flatten(1, 2)
+        three = [x.flatten(1, 2).repeat_interleave(3, 1) for x in (local, target)]
+        return Rows(part.flatten(1).repeat_interleave(3, 1), three[0], three[1], direction)
+
+    def _with_rest(self, prior: PosePrior, support: Float[Tensor, "batch parts"]) -> PosePrior:
+        """The prior, joined by a pull towards the rest pose on every joint below which little is seen."""
+        if self.config.rest_sd == 0:
+            return prior
+        seen = support @ self.body.part_moves[:, 6:].to(support)  # (B, joint parameters)
+        rest = 1 / (self.config.rest_sd**2 * (1 + seen / self.config.rest_support))
+        rest = torch.cat([torch.zeros_like(rest[:, :6]), rest], 1)
+        toward = torch.cat([torch.zeros_like(prior.mean[:, :6]), self.body.rest.expand(len(rest), -1)], 1)
+        precision = prior.precision + rest
+        mean = (prior.precision * prior.mean + rest * toward) / precision.clamp_min(1e-12)
+        return PosePrior(mean, precision)
+
+    def _result(
+        self,
+        observation: Observation,
+        pose: Float[Tensor, "batch parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior,
+        bound: Tensor,
+        status: Tensor,
+    ) -> Registration:
+        config, cloud = self.config, observation.cloud
+        posed = self.body(pose, size)
+        foot = foot_point(posed, cloud.points, config.visible)
+        labelling = self.label(posed, foot, observation, config.sigma_last)
+        rows, support = self.rows(posed, foot, labelling, observation)
+        full = self._with_rest(prior, support)
+        _, jacobian = linearize_by_screws(self.body, size, rows, full, config.fitting)(pose)
+        information = jacobian.mT @ jacobian
+        factor, failed = torch.linalg.cholesky_ex(information)
+        covariance = torch.where((failed == 0)[:, None, None], torch.cholesky_inverse(factor), torch.inf)
+        count = cloud.mask.sum(1).clamp_min(1)
+        nearest = foot.distance.amin(1) * cloud.mask
+        misfit = nearest.clamp_max(0.2).sum(1) / count
+        if config.silhouette.weight > 0:
+            misfit = misfit + overhang(posed, observation.nearest, observation.camera, config.silhouette)
+        return Registration(
+            pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, bound, status
+        )
+
+
+def _rows(value: Tensor, batch: int) -> Tensor:
+    return value if value.shape[0] == batch else value.expand(batch, *value.shape[1:])
+
+
+def is_finite(registration: Registration) -> Bool[Tensor, " batch"]:
+    """Which rows have a usable answer."""
+    return registration.pose.isfinite().all(1) & (registration.status != int(Status.NON_FINITE))
