@@ -64,7 +64,9 @@ def rotation_between(
 
 def angle_between(first: Float[Tensor, "*batch 3"], second: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """Angle between two vectors of any length, rad in [0, pi]; exact near 0 and pi, where arccos is not."""
-    cross = torch.linalg.cross(first, second).norm(dim=-1)
+    cross = torch.linalg.cross(first, second)
+    # A norm has no derivative at zero, where aligned vectors lie; the floor makes it 0 there.
+    cross = (cross * cross).sum(-1).clamp_min(torch.finfo(first.dtype).tiny).sqrt()
     return torch.atan2(cross, (first * second).sum(-1))
 
 

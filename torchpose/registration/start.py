@@ -1,0 +1,180 @@
+"""A pose from a single frame of which nothing is known: many starts, fitted in one batch, the best arms combined.
+
+Left-camera frame, metres and radians.
+"""
+
+from dataclasses import dataclass, replace
+from math import cos, pi, radians, sin
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from torchpose.body.model import BodyModel
+from torchpose.registration.labelling import LabellingConfig
+from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
+from torchpose.vision.faces import Faces
+from torchpose.vision.points import PointCloud
+
+# Directions of the left upper arm and forearm in the torso's frame (x to the left, y down, z back), from which arms
+# start: hanging, hanging bent, to the side, forward, up, side bent up, guard, forward low.
+ARMS = (
+    ((0.15, 1.0, 0.0), (0.05, 1.0, -0.1)),
+    ((0.25, 1.0, 0.1), (0.0, 0.3, -1.0)),
+    ((1.0, 0.05, -0.05), (1.0, 0.0, -0.15)),
+    ((0.1, 0.1, -1.0), (0.0, 0.0, -1.0)),
+    ((0.3, -1.0, -0.1), (0.1, -1.0, -0.1)),
+    ((1.0, 0.1, 0.0), (0.2, -0.8, -0.6)),
+    ((0.2, 0.9, -0.4), (-0.2, -0.8, -0.7)),
+    ((0.3, 0.6, -0.8), (-0.2, 0.3, -0.9)),
+)
+# The same for thigh and shank: standing and sitting.
+LEGS = (((0.08, 1.0, -0.03), (0.05, 1.0, 0.03)), ((0.2, 0.25, -1.0), (0.1, 1.0, 0.0)))
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    points: int = 200  # of the cloud, for the many starts
+    rounds: int = 5  # of these starts
+    final_rounds: int = 8  # of the best few, on all points
+    finalists: int = 4
+    sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
+    face_yaws: tuple[float, ...] = (-40.0, 0.0, 40.0)  # degrees, tried when a face is seen
+    yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
+    back_penalty: float = 0.004  # m of misfit that a pose turned away from the camera must make good
+    sitting: bool = True  # also try bent legs
+
+    def __post_init__(self) -> None:
+        for name in ("points", "rounds", "final_rounds", "finalists"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not (self.yaws and self.face_yaws):
+            raise ValueError("yaws and face_yaws need at least one angle each, in degrees")
+
+
+class Starter(nn.Module):
+    """Finds the pose in one frame from a list of plausible ones."""
+
+    def __init__(self, body: BodyModel, config: StartConfig, registration: RegistrationConfig):
+        super().__init__()
+        self.body = body
+        self.config = config
+        self.registrar = Registrar(body, registration)
+        # Far from the answer neighbours agree on wrong labels, and single points are many enough.
+        alone = LabellingConfig(sweeps=0, potts=0.0)
+        self.coarse = Registrar(body, replace(registration, labelling=alone))
+
+    def forward(
+        self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
+    ) -> Registration:
+        """Register one frame (batch 1) without a known pose.
+
+        Every start is fitted on a few points; of the best heading the arms are exchanged in all pairs, and the best few
+        combinations are fitted on all points. The registration with the least misfit is returned.
+        """
+        starts = self.hypotheses(observation, faces, size)
+        few = _thin(observation, self.config.points)
+        rough = self.coarse(few, starts, size, rounds=self.config.rounds, sigma_first=self.config.sigma)
+        misfit = rough.misfit + self.config.back_penalty * self._turned_away(rough.pose)
+        combined = torch.cat([rough.pose, self._exchange_arms(rough.pose, misfit)])
+        again = self.coarse(few, combined, size, rounds=1, sigma_first=self.registrar.config.sigma_last)
+        score = again.misfit + self.config.back_penalty * self._turned_away(again.pose)
+        best = score.topk(min(self.config.finalists, len(score)), largest=False).indices
+        final = self.registrar(observation, again.pose[best], size, rounds=self.config.final_rounds)
+        score = final.misfit + self.config.back_penalty * self._turned_away(final.pose)
+        return select(final, score.argmin())
+
+    def hypotheses(
+        self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
+    ) -> Float[Tensor, "starts parameters"]:
+        """Poses to start from: headings x arms, standing, and a few sitting."""
+        yaws = self.config.face_yaws if bool(faces.found[0]) else self.config.yaws
+        limbs = [(arm, LEGS[0]) for arm in ARMS]
+        if self.config.sitting:
+            limbs += [(ARMS[0], LEGS[1]), (ARMS[1], LEGS[1])]
+        directions = torch.stack([_directions(arm, leg) for arm, leg in limbs]).to(size)
+        heading = torch.tensor([radians(yaw) for yaw in yaws]).to(size)
+        Y, L = len(heading), len(limbs)
+        root = torch.zeros(Y * L, 3).to(size)
+        root[:, 0] = heading.repeat_interleave(L)
+        pelvis = pelvis_position(observation.cloud, faces, size, self.body).expand(Y * L, 3)
+        return self.body.pose_from_directions(pelvis, root, directions.repeat(Y, 1, 1))
+
+    def _exchange_arms(
+        self, pose: Float[Tensor, "starts parameters"], misfit: Float[Tensor, " starts"]
+    ) -> Float[Tensor, "combinations parameters"]:
+        """The best start with each left arm and each right arm of the eight best starts."""
+        names = self.body.parameter_names
+        arms = [
+            [i for i, name in enumerate(names) if name.startswith(("upper_arm" + side, "forearm" + side))]
+            for side in ("_left", "_right")
+        ]
+        order = misfit.argsort()[:8]
+        left, right = (part.flatten() for part in torch.meshgrid(order, order, indexing="ij"))
+        combined = pose[order[:1]].repeat(len(left), 1)
+        for index, chosen in zip(arms, (left, right), strict=True):
+            combined[:, index] = pose[chosen][:, index]
+        return combined
+
+    def _turned_away(self, pose: Float[Tensor, "starts parameters"]) -> Bool[Tensor, " starts"]:
+        return pose[:, 3].cos() < cos(0.6 * pi)
+
+
+def pelvis_position(
+    cloud: PointCloud, faces: Faces, size: Float[Tensor, "#batch sizes"], body: BodyModel
+) -> Float[Tensor, "batch 3"]:
+    """A first guess of the middle of the hips, m: below the face, or below the head's top over the cloud's middle."""
+    posed = body(torch.zeros(1, body.num_parameters).to(size), size[:1])
+    down = -posed.centers[0, body.segment_names.index("head"), 1]  # hips below the head's centre, upright
+    crown = posed.radii[0, body.segment_names.index("head"), 1]
+    nan = torch.nan
+    points = torch.where(cloud.mask[..., None], cloud.points, nan)
+    middle = points.nanmedian(1).values
+    column = (points[..., 0] - middle[:, None, 0]).abs() < 0.12
+    tops = torch.where(column, points[..., 1], nan)
+    # A few stray points may stand above the head: the second hundredth is taken, not the least.
+    top = torch.nanquantile(tops, 0.02, dim=1) + crown
+    head = torch.where(faces.found[:, None], faces.position, torch.stack([middle[:, 0], top, middle[:, 2]], -1))
+    y = head[:, 1] + down
+    trunk = (points[..., 1] - (y - 0.2)[:, None]).abs() < 0.25
+    x, z = (torch.where(trunk, points[..., i], nan).nanmedian(1).values for i in (0, 2))
+    x, z = torch.where(x.isfinite(), x, middle[:, 0]), torch.where(z.isfinite(), z, middle[:, 2])
+    # The cloud is the body's front: the hips lie half a trunk's depth behind it.
+    return torch.stack([x, y, z + 0.11], -1)
+
+
+def select(registration: Registration, row: Tensor) -> Registration:
+    """One row of a registration, as a batch of 1."""
+    picked = {name: getattr(registration, name) for name in Registration.__dataclass_fields__}
+    bound = picked.pop("bound")
+    return Registration(**{name: value[row][None] for name, value in picked.items()}, bound=bound[:, row][:, None])
+
+
+def _directions(
+    arm: tuple[tuple[float, ...], tuple[float, ...]], leg: tuple[tuple[float, ...], tuple[float, ...]]
+) -> Float[Tensor, "limbs 3"]:
+    """Limb directions of a symmetric pose in the order of the body file: head, left and right arm, left and right leg."""
+    mirror = torch.tensor([-1.0, 1.0, 1.0])
+    arms, legs = torch.tensor(arm), torch.tensor(leg)
+    head = torch.tensor([[0.0, -cos(0.1), -sin(0.1)]])
+    rows = torch.cat([head, arms, arms * mirror, legs, legs * mirror])
+    return torch.nn.functional.normalize(rows, dim=-1)
+
+
+def _thin(observation: Observation, num: int) -> Observation:
+    """About `num` of the points, evenly along the grid; without neighbours, which thinning parts."""
+    cloud = observation.cloud
+    count = int(cloud.mask[0].sum())
+    if count <= num:
+        return observation
+    keep = torch.linspace(0, count - 1, num, device=cloud.mask.device).round().long()
+    index = cloud.mask[0].nonzero()[:, 0][keep]
+    neighbours = torch.full_like(cloud.neighbours[:, index], num)
+    thin = PointCloud(
+        points=cloud.points[:, index],
+        pixels=cloud.pixels[:, index],
+        grid=cloud.grid[:, index],
+        mask=cloud.mask[:, index],
+        neighbours=neighbours,
+    )
+    return Observation(thin, observation.potential[:, index], observation.nearest, observation.camera)
