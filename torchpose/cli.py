@@ -1,0 +1,157 @@
+"""The command line: settings as `key=value`, checked before anything runs, and errors of one sentence."""
+
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import torch
+
+from torchpose.settings import compose_config, config_groups, describe
+
+PACKAGE = Path(__file__).resolve().parent
+# Inside the wheel, or beside the package in a checkout.
+CONFIGS = PACKAGE / "configs" if (PACKAGE / "configs").is_dir() else PACKAGE.parent / "configs"
+
+BAD_INPUT = 2  # exit codes
+INTERRUPTED = 130
+
+Kind = Literal["infer", "train"]
+
+
+@dataclass(frozen=True)
+class InferConfig:
+    """Recover a person's joint angles from a recording by a stereo or depth camera."""
+
+    recording: str | None = None  # folder of the recording; null: one that the package makes itself
+    output: str = "runs/infer"  # folder for the results
+    max_frames: int | None = None  # take only the first so many frames
+    fresh: bool = False  # start over instead of continuing an interrupted run
+    seed: int = 0  # the same seed gives the same results
+    device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
+    threads: int = 1  # of the processor; more help only where cores are idle
+
+    def __post_init__(self) -> None:
+        if self.max_frames is not None and self.max_frames < 1:
+            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}; null takes all frames")
+        _check_machine(self.seed, self.threads)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Train and score the activity recogniser, and compare its features."""
+
+    output: str = "runs/train"  # folder for the results
+    fresh: bool = False  # start over instead of continuing an interrupted run
+    seed: int = 0  # the same seed gives the same results
+    device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
+    threads: int = 1  # of the processor; more help only where cores are idle
+
+    def __post_init__(self) -> None:
+        _check_machine(self.seed, self.threads)
+
+
+CONFIG_TYPES: dict[Kind, type[InferConfig] | type[TrainConfig]] = {"infer": InferConfig, "train": TrainConfig}
+
+
+@overload
+def load_config(kind: Literal["infer"], overrides: Sequence[str] = ()) -> InferConfig: ...
+@overload
+def load_config(kind: Literal["train"], overrides: Sequence[str] = ()) -> TrainConfig: ...
+@overload
+def load_config(kind: Kind, overrides: Sequence[str] = ()) -> InferConfig | TrainConfig: ...
+def load_config(kind: Kind, overrides: Sequence[str] = ()) -> InferConfig | TrainConfig:
+    """The configuration of a command: the defaults, then `configs/{kind}.yaml`, then `overrides`.
+
+    An override is `key=value`, with dots between the levels, or `group=NAME`, which takes
+    `configs/group/NAME.yaml`. Raises ValueError, in one sentence, for an unknown key or a wrong value.
+    """
+    return compose_config(CONFIG_TYPES[kind], CONFIGS, kind, overrides)
+
+
+def help_text(kind: Kind) -> str:
+    """What `--help` prints: purpose, usage, and every setting with its default and its meaning."""
+    groups = config_groups(CONFIGS, kind)
+    parts = [
+        inspect.getdoc(CONFIG_TYPES[kind]),
+        f"usage: python {kind}.py [key=value ...]",
+        f"settings, with their defaults:\n{describe(load_config(kind))}",
+    ]
+    if groups:
+        sets = "\n".join(f"  {group}=NAME, one of {', '.join(names)}" for group, names in groups.items())
+        parts.append(f"sets of settings, from configs/:\n{sets}")
+    return "\n\n".join(map(str, parts)) + "\n"
+
+
+def infer_main(argv: Sequence[str]) -> int:
+    """`python infer.py`: returns the exit code, see `run_command`."""
+    return run_command("infer", argv, infer)
+
+
+def train_main(argv: Sequence[str]) -> int:
+    """`python train.py`: returns the exit code, see `run_command`."""
+    return run_command("train", argv, train)
+
+
+def infer(config: InferConfig, device: torch.device) -> None:
+    """Recover the poses of a recording, and write and print the results."""
+    raise NotImplementedError
+
+
+def train(config: TrainConfig, device: torch.device) -> None:
+    """Train and score the activity recogniser, and write and print the results."""
+    raise NotImplementedError
+
+
+def run_command(kind: Kind, argv: Sequence[str], action: Callable[[Any, torch.device], None]) -> int:
+    """Run `action` with the configuration that `argv` describes, and its device; returns the exit code.
+
+    0: done. 2: the input is at fault, and a sentence on stderr says how. 130: interrupted. An error that the
+    package did not raise itself is a fault of ours, and goes on with its traceback.
+    """
+    try:
+        if {"-h", "--help"} & set(argv):
+            print(help_text(kind), end="")
+            return 0
+        config = load_config(kind, argv)
+        torch.set_num_threads(config.threads)
+        torch.manual_seed(config.seed)
+        action(config, find_device(config.device))
+    except KeyboardInterrupt:
+        print("\ninterrupted: the same command again goes on where this one stopped", file=sys.stderr)
+        return INTERRUPTED
+    except OSError as error:
+        print(f"error: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return BAD_INPUT
+    except ValueError as error:
+        if not _raised_by_the_package(error):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    return 0
+
+
+def find_device(name: str) -> torch.device:
+    """The device called `name`; ValueError where this machine has none."""
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
+        raise ValueError(
+            f"device must be one that this machine has, got {name!r}; device=cpu works everywhere"
+        ) from error
+
+
+def _check_machine(seed: int, threads: int) -> None:
+    if seed < 0:
+        raise ValueError(f"seed must be 0 or more, got {seed}; choose another")
+    if threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}; 1 is the default")
+
+
+def _raised_by_the_package(error: BaseException) -> bool:
+    traceback = error.__traceback__
+    while traceback is not None and traceback.tb_next is not None:
+        traceback = traceback.tb_next
+    return traceback is not None and PACKAGE in Path(traceback.tb_frame.f_code.co_filename).resolve().parents
