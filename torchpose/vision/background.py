@@ -1,0 +1,397 @@
+"""Which pixels are the person: a background model of colour or depth, and the silhouette refined by depth.
+
+Images are RGB in [0, 1], depth is metres along the left camera's z axis, NaN where there is no reading.
+Log-odds are log P(foreground) / P(background) per pixel, saturated so that no one cue settles a pixel.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import kornia.morphology
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchpose.vision.camera import StereoCamera
+from torchpose.vision.photometry import noise_line, relative_gain, temporal_median
+from torchpose.vision.windows import window_max, window_mean, window_min
+
+Frames = Float[Tensor, "frames 3 height width"]
+Plane = Float[Tensor, "height width"]
+Planes = Float[Tensor, "batch height width"]
+
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """Settings of `BackgroundModel`. Thresholds are in units of the noise variance."""
+
+    noise_floor: float = 0.008  # standard deviation that no pixel falls below: two of 255 levels
+    gain_tolerance: float = 0.01  # relative brightness error left after the gain of a frame is taken out
+    jitter: float = 0.15  # px, tremor of the camera: matters at edges of the background
+    shadow_min: float = 0.4  # a cast shadow leaves at least this share of the light
+    shadow_tint: float = 0.03  # relative change of colour in a shadow, lit by another part of the room
+    unchanged_threshold: float = 2.5  # mean squared change of a 3 x 3 window from which it has changed
+    shadow_threshold: float = 1.2  # mean squared misfit of a 5 x 5 window from which it is no shadow
+    max_frames: int = 15  # `from_recording` looks at that many frames
+
+    def __post_init__(self) -> None:
+        for name in ("noise_floor", "unchanged_threshold", "shadow_threshold"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("gain_tolerance", "jitter", "shadow_tint"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
+        if not 0 < self.shadow_min <= 1:
+            raise ValueError(f"shadow_min must be in (0, 1], got {self.shadow_min}; 1 means no shadows")
+        if self.max_frames < 1:
+            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
+
+
+class BackgroundModel(nn.Module):
+    """Foreground log-odds from what the empty scene looks like.
+
+    A pixel is background if a 3 x 3 window that holds it has not changed, or if a 5 x 5 one is the empty
+    scene's texture darkened by one factor: a cast shadow keeps colour and texture. Of the windows that hold a
+    pixel the best counts, so that the edge of a shadow or of the person does not widen.
+    """
+
+    center: Float[Tensor, "3 height width"]  # the empty scene
+    variance: Float[Tensor, "3 height width"]  # of an unchanged pixel's difference from it
+    _weight: Tensor
+    _shadow_weight: Tensor
+    _square_weight: Tensor
+    _power: Tensor
+
+    def __init__(self, frames: Frames, config: BackgroundConfig = BackgroundConfig()):
+        """Learn from K frames (K, 3, H, W) of the empty scene; one will do, two measure the noise better."""
+        super().__init__()
+        if frames.shape[0] == 0:
+            raise ValueError(
+                "the background needs at least 1 frame, got 0; use BackgroundModel.from_recording"
+            )
+        if not bool(torch.isfinite(frames).all()) or frames.min() < 0 or frames.max() > 1:
+            raise ValueError("background frames must be finite and in [0, 1]; divide 8-bit images by 255")
+        self.config = config
+        count = frames.shape[0]
+        center = temporal_median(frames)
+        frames = frames / relative_gain(frames, center)
+        center = temporal_median(frames)
+        noise = noise_line(frames)
+        level = (noise[0] + noise[1] * center).clamp_min(config.noise_floor**2)
+        if count >= 5:  # enough to see a pixel flicker: a screen, a leaf, or a person who stood there
+            spread = window_mean((1.4826 * (frames - center).abs().median(0).values).square(), 1)
+            level = level + (spread - 4 * level).clamp_min(0)
+        edges = _gradient_squared(center)
+        variance = (
+            level * (1 + 1 / count) + config.jitter**2 * edges + (config.gain_tolerance * center).square()
+        )
+        tinted = variance + (config.shadow_tint * center).square()
+        self.register_buffer("center", center, persistent=False)
+        self.register_buffer("variance", variance, persistent=False)
+        self.register_buffer("_weight", 1 / (3 * variance), persistent=False)
+        self.register_buffer("_shadow_weight", center / (3 * tinted), persistent=False)
+        self.register_buffer("_square_weight", 1 / (3 * tinted), persistent=False)
+        self.register_buffer(
+            "_power",
+            window_mean((center.square() / (3 * tinted)).sum(0), 2).clamp_min(1e-12),
+            persistent=False,
+        )
+
+    @classmethod
+    def from_recording(
+        cls, frames: Frames, config: BackgroundConfig = BackgroundConfig()
+    ) -> "BackgroundModel":
+        """Learn from a recording (T, 3, H, W) with people in it: the median over evenly spread frames.
+
+        Right where the background is seen in more than half of them; who stayed longer is taken for it.
+        """
+        count = min(len(frames), config.max_frames)
+        picked = torch.linspace(0, max(len(frames) - 1, 0), count, device=frames.device).round().long()
+        return cls(frames[picked], config)
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:
+        """Log-odds in [-6, 4]: about -6 unchanged, -2 darkened like a shadow, 4 something else.
+
+        What looks like a shadow may be a grey shirt: depth tells, in `person_silhouette`. So match the stereo
+        pair in `search_region`, which keeps both, and not where the log-odds are positive.
+        """
+        if images.shape[-2:] != self.center.shape[-2:]:
+            raise ValueError(
+                f"images must have the background's size {tuple(self.center.shape[-2:])}, "
+                f"got {tuple(images.shape[-2:])}; record the background with the same camera"
+            )
+        images = images / relative_gain(images, self.center)
+        change = (self._weight * (images - self.center).square()).sum(1)  # 1 on average if unchanged
+        unchanged = window_min(window_mean(change, 1), 1)
+        log_unchanged = (4 * (unchanged - self.config.unchanged_threshold)).clamp(-6, 4)
+        shaded = window_min(self._shadow_misfit(images), 2)
+        log_shaded = (3 * (shaded - self.config.shadow_threshold)).clamp(-2, 4)
+        log_odds = torch.minimum(log_unchanged, log_shaded)
+        # A pixel on the person's edge mixes both and belongs to the side that gave it more than half: beside
+        # unchanged pixels, its change must be half of the strongest near by (a quarter of the square).
+        mixed = (change < 0.25 * window_max(change, 1)) & (window_min(log_unchanged, 1) < 0)
+        return torch.where(mixed & (log_unchanged > 0), log_odds.clamp_max(-4), log_odds)
+
+    def _shadow_misfit(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:
+        """Mean over 5 x 5 windows of (image - s center)^2 / variance, at the best s in [shadow_min, 1]."""
+        product = window_mean((self._shadow_weight * images).sum(1), 2)
+        square = window_mean((self._square_weight * images.square()).sum(1), 2)
+        scale = (product / self._power).clamp(self.config.shadow_min, 1)
+        return square - 2 * scale * product + scale.square() * self._power
+
+
+@dataclass(frozen=True)
+class DepthBackgroundConfig:
+    """Settings of `DepthBackground`; noise is noise_floor + noise_growth Z^2."""
+
+    noise_floor: float = 0.02  # m
+    noise_growth: float = 0.003  # m per m^2: 3 cm at 3 m
+    outliers: float = 0.02  # share of readings that are anywhere
+    max_depth: float = 10.0  # m, readings are believed up to here
+
+    def __post_init__(self) -> None:
+        if not (self.noise_floor > 0 and self.noise_growth >= 0):
+            raise ValueError(
+                f"noise_floor must be positive and noise_growth not negative, got {self.noise_floor} and "
+                f"{self.noise_growth}"
+            )
+        if not 0 < self.outliers < 1:
+            raise ValueError(f"outliers must be in (0, 1), got {self.outliers}")
+        if not self.max_depth > 0:
+            raise ValueError(f"max_depth must be positive, got {self.max_depth}")
+
+
+class DepthBackground(nn.Module):
+    """Foreground log-odds of a depth camera from the empty scene's depth; the noise grows as Z^2."""
+
+    depth: Plane  # m, NaN where the empty scene gave no reading
+
+    def __init__(
+        self,
+        frames: Float[Tensor, "frames height width"],
+        config: DepthBackgroundConfig = DepthBackgroundConfig(),
+    ):
+        """Learn from K frames (K, H, W) in metres; NaN, 0 and what is beyond `max_depth` are no readings."""
+        super().__init__()
+        if frames.shape[0] == 0:
+            raise ValueError("the background needs at least 1 depth frame, got 0; record the empty scene")
+        self.config = config
+        self.register_buffer(
+            "depth", _clean_depth(frames, config.max_depth).nanmedian(0).values, persistent=False
+        )
+
+    def forward(self, depth: Planes) -> Planes:
+        """Log-odds in [-4, 4] of frames in metres: 0 without a reading, 1 if only the background has none."""
+        if depth.shape[-2:] != self.depth.shape:
+            raise ValueError(
+                f"depth must have the background's size {tuple(self.depth.shape)}, "
+                f"got {tuple(depth.shape[-2:])}; record the background with the same camera"
+            )
+        depth, config = _clean_depth(depth, self.config.max_depth), self.config
+        sigma = config.noise_floor + config.noise_growth * self.depth.square()
+        outlier = config.outliers / config.max_depth
+        foreground = torch.where(depth < self.depth, (1 - config.outliers) / self.depth, 0) + outlier
+        background = (1 - config.outliers) * _normal(depth - self.depth, sigma) + outlier
+        log_odds = torch.where(self.depth.isnan(), 1, torch.log(foreground / background).clamp(-4, 4))
+        return torch.where(depth.isnan(), 0, log_odds)
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """The person's pixels."""
+
+    mask: Bool[Tensor, "batch height width"]
+
+
+@dataclass(frozen=True)
+class SilhouetteConfig:
+    """Settings of `person_silhouette` and `search_region`."""
+
+    search_threshold: float = -3.0  # log-odds above which a pixel is searched: unchanged ones are not
+    search_margin: int = 4  # px added around
+    depth_range: float = 1.0  # m, the person's depth to either side of the middle
+    depth_noise: float = 0.003  # m per m^2 of depth, where no stereo camera is given
+    disparity_noise: float = 0.25  # px, of a stereo camera
+    noise_floor: float = 0.02  # m
+    depth_weight: float = 3.0  # greatest log-odds that depth gives for or against a pixel
+    agreement: int = 2  # px, depth counts where it says the same all around: edges are fattened
+    bridge: int = 2  # px, parts apart by up to twice this belong together
+    max_hole: float = 0.002  # share of the person; larger holes stay if the background is seen through them
+    min_area: float = 0.004  # share of the image below which there is no person
+
+    def __post_init__(self) -> None:
+        for name in ("depth_range", "depth_noise", "disparity_noise", "noise_floor"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("search_margin", "agreement", "bridge", "depth_weight", "max_hole"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        if not 0 < self.min_area < 1:
+            raise ValueError(f"min_area must be a share of the image in (0, 1), got {self.min_area}")
+
+
+def search_region(
+    log_odds: Planes, config: SilhouetteConfig = SilhouetteConfig()
+) -> Bool[Tensor, "batch height width"]:
+    """Where to match the stereo pair: all that has changed, shadows too, for a grey shirt looks like one."""
+    changed = window_min((log_odds > config.search_threshold).to(log_odds.dtype), 1)  # a lone pixel is noise
+    return window_max(changed, 1 + config.search_margin) > 0
+
+
+def person_silhouette(
+    log_odds: Planes,
+    depth: Planes,
+    config: SilhouetteConfig = SilhouetteConfig(),
+    background_depth: Plane | None = None,
+    camera: StereoCamera | None = None,
+) -> Silhouette:
+    """The person's silhouette: foreground of the background model, refined by depth (T. Fig. 3.6).
+
+    Depth adds to the log-odds: for the person in front of the background, against where it is the
+    background's own (a floor shadow lies on the floor), and what is far from the person's depth goes. Then
+    specks go, narrow gaps close, the largest connected part stays and its holes are filled, except those
+    through which the background is seen. A frame without enough foreground gets an empty mask.
+
+    Args:
+        log_odds: (B, H, W) of `BackgroundModel` or `DepthBackground`.
+        depth: (B, H, W) m, NaN where there is none; all NaN leaves colour alone to decide.
+        background_depth: (H, W) m of the empty scene, NaN where unknown.
+        camera: a stereo camera makes depth's noise `disparity_noise` Z^2 / (f b).
+    """
+    count, height, width = log_odds.shape
+    if depth.shape != log_odds.shape:
+        raise ValueError(
+            f"depth must have log_odds' shape {(count, height, width)}, got {tuple(depth.shape)}"
+        )
+    if background_depth is None:
+        background_depth = depth.new_full((height, width), torch.nan)
+    if background_depth.shape != (height, width):
+        raise ValueError(
+            f"background_depth must be one image of {(height, width)}, got {tuple(background_depth.shape)}; "
+            "take the median if there are several"
+        )
+    growth = config.depth_noise
+    if camera is not None and camera.baseline is not None:
+        growth = config.disparity_noise / (camera.focal_length * camera.baseline)
+    sigma = config.noise_floor + growth * background_depth.square()
+    # Depth cannot outvote log-odds below -depth_weight, so all else happens in the box of the pixels above.
+    rows, columns = _box(log_odds > -config.depth_weight, 2 * config.agreement + 2 * config.bridge + 2)
+    middle = _person_depth(log_odds, depth, background_depth - 3 * sigma)
+    log_odds, depth = log_odds[:, rows, columns], depth[:, rows, columns]
+    background_depth, sigma = background_depth[rows, columns], sigma[rows, columns]
+    log_odds = log_odds + _depth_evidence(depth, background_depth, sigma, middle, config)
+    mask = (log_odds > 0).to(log_odds.dtype)[:, None]
+    mask = kornia.morphology.opening(mask, log_odds.new_tensor([[0, 1, 0], [1, 1, 1], [0, 1, 0]]))
+    closed = window_min(window_max(mask[:, 0], 1), 1)  # narrow gaps, unless depth or colour deny them
+    mask = torch.maximum(mask[:, 0], closed * (log_odds > -2))
+    bridged = window_max(mask, config.bridge)
+    smallest = max(1, math.ceil(config.min_area * height * width))
+    whole = torch.zeros(count, height, width, dtype=torch.bool, device=mask.device)
+    for index in range(count):
+        whole[index, rows, columns] = _largest_part(
+            mask[index] > 0, bridged[index] > 0, log_odds[index], smallest, config.max_hole
+        )
+    return Silhouette(whole)
+
+
+def _depth_evidence(
+    depth: Planes,
+    background_depth: Plane,
+    sigma: Plane,
+    middle: Float[Tensor, " batch"],
+    config: SilhouetteConfig,
+) -> Planes:
+    """Log-odds that depth adds, 0 where it is unknown or where it says different things near by."""
+    outliers, span = 0.02, 5.0  # share of the readings, and metres over which they lie
+    in_front = ~(depth > background_depth + sigma)  # True where the background is unknown
+    near = ~((depth - middle[:, None, None]).abs() > config.depth_range)  # True where either is unknown
+    usual = (1 - outliers) / (2 * config.depth_range) + outliers / span
+    log_person = torch.where(in_front & near, math.log(usual), math.log(outliers / span))
+    at_background = (1 - outliers) * _normal(depth - background_depth, sigma) + outliers / span
+    log_background = torch.where(background_depth.isnan(), math.log(1 / span), at_background.log())
+    evidence = (log_person - log_background).clamp(-config.depth_weight, config.depth_weight)
+    evidence = torch.where(near, evidence, -2 * config.depth_weight)  # out, whatever the colour
+    unknown = depth.isnan()
+    lowest = window_min(evidence.masked_fill(unknown, math.inf), config.agreement)
+    highest = window_max(evidence.masked_fill(unknown, -math.inf), config.agreement)
+    # The least that all readings around agree on; without any, lowest is inf and highest -inf.
+    return torch.where(lowest <= highest, lowest.clamp_min(0) + highest.clamp_max(0), 0)
+
+
+def _person_depth(log_odds: Planes, depth: Planes, limit: Plane) -> Float[Tensor, " batch"]:
+    """Depth (m) about which most of the foreground lies, NaN if there is none: a smooth histogram's mode.
+
+    Of the foreground clearly in front of the background (`limit`, m), if there is any.
+    """
+    step, bins = 0.1, 200
+    log_odds, depth, limit = log_odds[:, ::2, ::2], depth[:, ::2, ::2], limit[::2, ::2]
+    counted = (log_odds > 0) & (depth > 0)
+    before = counted & (depth < limit)
+    counted = torch.where(before.flatten(1).any(1)[:, None, None], before, counted)
+    index = (torch.where(counted, depth, 0) / step).long().clamp_max(bins - 1).flatten(1)
+    votes = depth.new_zeros(len(depth), bins).scatter_add(1, index, counted.flatten(1).to(depth.dtype))
+    offsets = torch.arange(-10, 11, device=depth.device, dtype=depth.dtype) * step
+    kernel = torch.exp(-0.5 * (offsets / 0.3).square())  # 0.3 m: half a person's extent in depth
+    smooth = F.conv1d(votes[:, None], kernel[None, None], padding=10)[:, 0]
+    return torch.where(votes.sum(1) > 0, (smooth.argmax(1) + 0.5) * step, torch.nan)
+
+
+def _box(wanted: Bool[Tensor, "batch height width"], margin: int) -> tuple[slice, slice]:
+    """Rows and columns of all wanted pixels of all frames, and `margin` more where the image goes on.
+
+    Only of pixels whose four neighbours are wanted too: no other survives the opening, and noise has few.
+    """
+    inner = wanted[:, 1:-1, 1:-1] & wanted[:, :-2, 1:-1] & wanted[:, 2:, 1:-1]
+    inner = (inner & wanted[:, 1:-1, :-2] & wanted[:, 1:-1, 2:]).any(0)
+    slices = []
+    for found in (inner.any(1), inner.any(0)):
+        index = found.nonzero()[:, 0].tolist() or [0]
+        slices.append(slice(max(0, index[0] + 1 - margin), index[-1] + 2 + margin))
+    return slices[0], slices[1]
+
+
+def _largest_part(
+    mask: Bool[Tensor, "height width"],
+    bridged: Bool[Tensor, "height width"],
+    log_odds: Plane,
+    min_area: int,
+    max_hole: float,
+) -> Bool[Tensor, "height width"]:
+    """The largest part of `mask` that `bridged` connects, holes filled; empty if it is below `min_area` px.
+
+    By OpenCV, on the CPU: kornia's union-find labels the same image in five times as long.
+    """
+    _, labels = cv2.connectedComponents(bridged.cpu().numpy().astype(np.uint8), connectivity=8)
+    labels[~mask.cpu().numpy()] = 0
+    areas = np.bincount(labels.ravel())
+    areas[0] = 0
+    if areas.max() < min_area:
+        return torch.zeros_like(mask)
+    person = labels == areas.argmax()
+    count, holes, stats, _ = cv2.connectedComponentsWithStats((~person).astype(np.uint8), connectivity=4)
+    total = np.bincount(holes.ravel(), weights=log_odds.cpu().numpy().ravel(), minlength=count)
+    left, top, width, height, area = stats.T
+    inside = (left > 0) & (top > 0) & (left + width < mask.shape[1]) & (top + height < mask.shape[0])
+    filled = inside & ((area <= max_hole * areas.max()) | (total > -2.5 * area))
+    filled[0] = True  # label 0 of the holes is the person
+    return torch.from_numpy(filled[holes]).to(mask.device)
+
+
+def _gradient_squared(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
+    padded = F.pad(image[None], (1, 1, 1, 1), mode="replicate")[0]
+    across = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
+    down = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
+    return 0.25 * (across.square() + down.square())
+
+
+def _clean_depth(
+    depth: Float[Tensor, "*batch height width"], greatest: float
+) -> Float[Tensor, "*batch height width"]:
+    return torch.where((depth > 0) & (depth <= greatest), depth, torch.nan)
+
+
+def _normal(deviation: Tensor, sigma: Tensor) -> Tensor:
+    return torch.exp(-0.5 * (deviation / sigma).square()) / (sigma * math.sqrt(2 * math.pi))

@@ -1,0 +1,84 @@
+"""Brightness of a camera: the gain between two pictures of a scene, and the noise level at each intensity.
+
+Images are RGB in [0, 1].
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+NOISE_BINS = 16  # of intensity, in which the noise level is measured
+TRIM = 0.9  # share of the squared differences that count: something that moved is in the rest
+TRIMMED_VARIANCE = 0.623  # of a unit normal cut off beyond its 90 %: 1 - 2 z phi(z) / 0.9 with z = 1.645
+GAIN_RANGE, GAIN_STEP = 0.6, 0.01  # of the gain's logarithm: 0.55 to 1.8, in bins of 1 %
+
+
+def relative_gain(
+    images: Float[Tensor, "batch 3 height width"], reference: Float[Tensor, "3 height width"]
+) -> Float[Tensor, "batch 3 1 1"]:
+    """Brightness of each image and channel relative to the reference, by the mode of the ratio.
+
+    The mode, for a person and their shadow draw the median aside. Every fourth pixel of a row and a column
+    counts, if neither black nor glaring; 1 where fewer than 5 % of them have a ratio of 0.55 to 1.8.
+    """
+    images, reference = images[..., ::4, ::4].flatten(2), reference[..., ::4, ::4].flatten(1)
+    usable = (reference > 0.05) & (reference < 0.95) & (images > 0.02) & (images < 0.98)
+    ratio = torch.log(images.clamp_min(0.02) / reference.clamp_min(0.02))  # (B, 3, n)
+    usable = usable & (ratio.abs() < GAIN_RANGE)
+    bins = round(2 * GAIN_RANGE / GAIN_STEP)
+    index = ((ratio + GAIN_RANGE) / GAIN_STEP).long().clamp(0, bins - 1)
+    votes = images.new_zeros(*images.shape[:2], bins).scatter_add(2, index, usable.to(images.dtype))
+    smooth = F.avg_pool1d(F.avg_pool1d(votes, 5, 1, 2), 5, 1, 2)
+    mode = (smooth.argmax(2, keepdim=True) + 0.5) * GAIN_STEP - GAIN_RANGE
+    for _ in range(3):  # mean shift to below the width of a bin
+        weight = usable * (1 - ((ratio - mode) / (5 * GAIN_STEP)).square()).clamp_min(0)
+        mode = mode + (weight * (ratio - mode)).sum(2, keepdim=True) / weight.sum(2, keepdim=True).clamp_min(
+            1e-6
+        )
+    enough = usable.sum(2, keepdim=True) > 0.05 * ratio.shape[2]
+    return torch.where(enough, mode.exp(), 1)[..., None].to(images.dtype)
+
+
+def noise_line(frames: Float[Tensor, "frames 3 height width"]) -> Float[Tensor, "2"]:
+    """Variance of the noise as a + b intensity (the sensor's and the photons' share), of one still scene.
+
+    Measured on the differences of successive frames, the greatest tenth left out. A single frame is judged by
+    its second differences along the rows, in the calmest fifth of blocks of 8 x 8 pixels.
+    """
+    if len(frames) > 1:
+        level = (0.5 * (frames[1:] + frames[:-1]))[..., ::2, ::2].flatten()
+        square = (0.5 * (frames[1:] - frames[:-1]).square())[..., ::2, ::2].flatten()
+        share, correction = TRIM, TRIMMED_VARIANCE
+    else:
+        second = (frames[..., 2:] - 2 * frames[..., 1:-1] + frames[..., :-2]).square() / 6
+        block = min(8, *second.shape[-2:])
+        level = F.avg_pool2d(frames[..., 1:-1], block).flatten()
+        square = F.avg_pool2d(second, block).flatten()
+        share, correction = 0.2, 1.0
+    bins = (level * NOISE_BINS).long().clamp(0, NOISE_BINS - 1)
+    rows = []
+    for index in range(NOISE_BINS):
+        chosen = square[bins == index]
+        if len(chosen) >= 10:  # fewer pixels say nothing
+            kept = chosen.sort().values[: math.ceil(share * len(chosen))]
+            middle = level[bins == index].mean()
+            rows.append(torch.stack([middle, kept.mean() / correction, kept.new_tensor(len(kept))]))
+    if not rows:
+        return square.new_zeros(2)
+    middle, variance, weight = torch.stack(rows).unbind(1)
+    weight = weight / weight.sum()
+    center = (weight * middle).sum()
+    # The tiny pull keeps the slope at 0 in a scene of one intensity.
+    slope = (weight * (middle - center) * variance).sum() / (
+        (weight * (middle - center).square()).sum() + 1e-4
+    )
+    return torch.stack([(weight * variance).sum() - slope * center, slope])
+
+
+def temporal_median(frames: Float[Tensor, "frames 3 height width"]) -> Float[Tensor, "3 height width"]:
+    """Median over frames, the mean of the middle two where their number is even."""
+    ordered = frames.sort(0).values
+    return 0.5 * (ordered[(len(frames) - 1) // 2] + ordered[len(frames) // 2])
