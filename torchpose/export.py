@@ -1,0 +1,266 @@
+"""Results as files: tables of poses, a summary, a video. Each file is there whole or not at all.
+
+Positions are in metres in the left camera's frame (x right, y down, z forward), angles in radians in tensors
+and in degrees in the table. Left and right are the subject's.
+"""
+
+import csv
+import dataclasses
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchpose.atomic import replacing
+
+STATUSES = ("absent", "entering", "tracked", "partial", "recovered", "lost")
+EMPTY_STATUSES = ("absent", "lost")  # frames without a pose: their cells are empty, whatever the tensors hold
+JOINT_NAMES = (
+    "pelvis",
+    "neck",
+    "head",
+    *(f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist") for side in ("left", "right")),
+    *(f"{joint}_{side}" for joint in ("hip", "knee", "ankle") for side in ("left", "right")),
+)
+_FIRST_COLUMNS = ("frame", "time_s", "status", "point_to_model_m")
+_VIDEO_CODECS = ("mp4v", "avc1")  # OpenCV's own wheels have the first
+
+
+@dataclass(frozen=True)
+class PoseSequence:
+    """The poses of one person over time, one row a frame; NaN where there is no number.
+
+    Tensors of any float dtype on any device; they are written as float64. Frames whose status is in
+    `EMPTY_STATUSES` have no pose, and what stands there is never written.
+    """
+
+    frame: Int[Tensor, " time"]  # the recording's frame numbers
+    time_s: Float[Tensor, " time"]  # s
+    status: tuple[str, ...]  # of each frame, one of `STATUSES`
+    point_to_model: Float[Tensor, " time"]  # m, mean distance of the points to the body (5.2)
+    joints: Float[Tensor, "time 15 3"]  # m, in the order of `JOINT_NAMES`
+    angle_names: tuple[str, ...]  # of the anatomical angles
+    angles: Float[Tensor, "time angles"]  # rad
+    angle_sd: Float[Tensor, "time angles"]  # rad, standard deviations
+    limb_angle_names: tuple[str, ...]
+    limb_angles: Float[Tensor, "time limb_angles"]  # rad, 0 = the two limbs aligned
+    pose: Float[Tensor, "time parameters"] | None = None  # m and rad, the body model's own
+    pose_covariance: Float[Tensor, "time parameters parameters"] | None = None
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.status) - set(STATUSES))
+        if unknown:
+            raise ValueError(f"status must be one of {', '.join(STATUSES)}, got {unknown[0]!r}; choose one")
+        for name, count in (
+            ("status", len(self.frame)),
+            ("angle_names", self.angles.shape[1]),
+            ("limb_angle_names", self.limb_angles.shape[1]),
+        ):
+            if len(getattr(self, name)) != count:
+                raise ValueError(
+                    f"{name} must have an entry for each of {count}, got {len(getattr(self, name))}; "
+                    "give as many names as there are columns, and as many statuses as there are frames"
+                )
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def answered(self) -> tuple[bool, ...]:
+        """Whether each frame has a pose."""
+        return tuple(status not in EMPTY_STATUSES for status in self.status)
+
+    @classmethod
+    def join(cls, parts: Sequence["PoseSequence"]) -> "PoseSequence":
+        """One sequence of several, in their order; all have the same names and the same optional fields."""
+        first = parts[0]
+        joined: dict[str, Any] = {}
+        for field in dataclasses.fields(cls):
+            values = [getattr(part, field.name) for part in parts]
+            if field.name in ("angle_names", "limb_angle_names"):
+                if any(value != values[0] for value in values):
+                    raise ValueError(
+                        f"{field.name} must be the same in all parts, got {values}; compute them alike"
+                    )
+                joined[field.name] = values[0]
+            elif field.name == "status":
+                joined[field.name] = tuple(status for value in values for status in value)
+            else:
+                joined[field.name] = None if getattr(first, field.name) is None else torch.cat(values)
+        return PoseSequence(**joined)
+
+    def without_stale_numbers(self) -> "PoseSequence":
+        """The sequence in float64 on the CPU, with NaN in every number of a frame that has no pose."""
+        empty = ~torch.tensor(self.answered, dtype=torch.bool)
+        cleaned: dict[str, Any] = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor) and value.is_floating_point():
+                value = value.detach().to("cpu", torch.float64)
+                if field.name != "time_s":
+                    value = value.masked_fill(empty.view(-1, *[1] * (value.ndim - 1)), torch.nan)
+            cleaned[field.name] = value
+        return PoseSequence(**cleaned)
+
+
+def pose_columns(angle_names: Sequence[str], limb_angle_names: Sequence[str]) -> list[str]:
+    """The columns of `poses.csv`, in order."""
+    return [
+        *_FIRST_COLUMNS,
+        *(f"{joint}_{axis}_m" for joint in JOINT_NAMES for axis in "xyz"),
+        *(f"{name}_{kind}" for name in angle_names for kind in ("deg", "sd_deg")),
+        *(f"{name}_deg" for name in limb_angle_names),
+    ]
+
+
+def write_poses_csv(path: Path, sequence: PoseSequence) -> None:
+    """Write `poses.csv`: a row a frame, to micrometres and 1e-4 degrees; cells without a number are empty."""
+    clean = sequence.without_stale_numbers()
+    degrees = torch.stack([clean.angles, clean.angle_sd], dim=-1).flatten(1)
+    columns = {
+        ".6f": torch.cat([clean.point_to_model[:, None], clean.joints.flatten(1)], dim=1),
+        ".4f": torch.cat([degrees, clean.limb_angles], dim=1).rad2deg(),
+    }
+    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(pose_columns(clean.angle_names, clean.limb_angle_names))
+        for row, status in enumerate(clean.status):
+            numbers = [
+                format(number, spec) if math.isfinite(number) else ""
+                for spec, values in columns.items()
+                for number in values[row].tolist()
+            ]
+            writer.writerow(
+                [int(clean.frame[row]), format(clean.time_s[row].item(), ".6f"), status, *numbers]
+            )
+
+
+def read_poses_csv(path: str | Path) -> PoseSequence:
+    """The sequence in a `poses.csv`, in float64; without `pose`, which the table has not.
+
+    Raises ValueError where the file is no such table.
+    """
+    path = Path(path)
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    names = header[len(_FIRST_COLUMNS) + 3 * len(JOINT_NAMES) :]
+    angle_names = [name.removesuffix("_sd_deg") for name in names if name.endswith("_sd_deg")]
+    limb_angle_names = [name.removesuffix("_deg") for name in names[2 * len(angle_names) :]]
+    if header != pose_columns(angle_names, limb_angle_names) or any(len(row) != len(header) for row in rows):
+        raise ValueError(
+            f"{path} must have the columns of poses.csv, got {', '.join(header[:6])} ...; make it anew"
+        )
+    cells = [[float(cell) if cell else math.nan for cell in row[3:]] for row in rows]
+    numbers = torch.tensor(cells, dtype=torch.float64).reshape(len(rows), len(header) - 3)
+    distance, joints, angles, limb_angles = numbers.split(
+        [1, 3 * len(JOINT_NAMES), 2 * len(angle_names), len(limb_angle_names)], dim=1
+    )
+    angle, sd = angles.deg2rad().unflatten(1, (len(angle_names), 2)).unbind(-1)
+    return PoseSequence(
+        frame=torch.tensor([int(row[0]) for row in rows], dtype=torch.int64),
+        time_s=torch.tensor([float(row[1]) for row in rows], dtype=torch.float64),
+        status=tuple(row[2] for row in rows),
+        point_to_model=distance[:, 0],
+        joints=joints.unflatten(1, (len(JOINT_NAMES), 3)),
+        angle_names=tuple(angle_names),
+        angles=angle,
+        angle_sd=sd,
+        limb_angle_names=tuple(limb_angle_names),
+        limb_angles=limb_angles.deg2rad(),
+    )
+
+
+def write_poses_npz(path: Path, sequence: PoseSequence) -> None:
+    """Write everything in full precision: an array for each field of `PoseSequence`, and `joint_names`."""
+    clean = sequence.without_stale_numbers()
+    fields = {field.name: getattr(clean, field.name) for field in dataclasses.fields(clean)}
+    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in fields.items() if value is not None}
+    with replacing(path) as partial:
+        np.savez(partial, joint_names=np.asarray(JOINT_NAMES), **arrays)
+
+
+def read_poses_npz(path: str | Path) -> PoseSequence:
+    """The sequence that `write_poses_npz` wrote."""
+    fields: dict[str, Any] = {}
+    with np.load(path) as arrays:
+        for name in set(arrays.files) - {"joint_names"}:
+            value = arrays[name]
+            fields[name] = tuple(map(str, value)) if value.dtype.kind == "U" else torch.from_numpy(value)
+    return PoseSequence(**fields)
+
+
+def write_summary(path: Path, summary: Mapping[str, object]) -> None:
+    """Write a mapping as JSON with sorted keys; dataclasses, tensors and paths will do, NaN becomes null."""
+    text = json.dumps(_jsonable(summary), indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    with replacing(path) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+class VideoWriter:
+    """Appends images to a video, see `open_video`."""
+
+    def __init__(self, path: Path, width: int, height: int, frame_rate: float) -> None:
+        self.width, self.height = width, height
+        self._padding = (0, width % 2, 0, height % 2)  # codecs want even sizes
+        size = (width + width % 2, height + height % 2)
+        for codec in _VIDEO_CODECS:
+            self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), frame_rate, size)
+            if self._writer.isOpened():
+                return
+        raise OSError(0, f"OpenCV has no encoder for {' or '.join(_VIDEO_CODECS)} here", str(path))
+
+    def write(self, image: Float[Tensor, "3 height width"]) -> None:
+        """Append an RGB image in [0, 1] of the video's size."""
+        if image.shape[1:] != (self.height, self.width):
+            raise ValueError(
+                f"images must have the video's size {self.width} x {self.height}, got {image.shape[2]} x "
+                f"{image.shape[1]}; open the video with the size of its images"
+            )
+        image = F.pad(image.detach().cpu()[None], self._padding, mode="replicate")[0]
+        levels = image.clamp(0, 1).mul(255).round().byte()
+        self._writer.write(np.ascontiguousarray(levels.permute(1, 2, 0).numpy()[..., ::-1]))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.release()
+
+
+@contextmanager
+def open_video(path: Path, width: int, height: int, frame_rate: float) -> Iterator[VideoWriter]:
+    """A writer for an MP4 file at `path`, which is there when the block ends without error."""
+    with replacing(path) as partial:
+        video = VideoWriter(partial, width, height, frame_rate)
+        try:
+            yield video
+        finally:
+            video.close()
+
+
+def _jsonable(value: Any) -> Any:
+    """`value` made of what JSON has: dictionaries, lists, strings, finite numbers, null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _jsonable(item) for key, item in value.items()}
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, Tensor | np.ndarray | np.generic):
+        return _jsonable(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_jsonable(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    return str(value)
