@@ -372,6 +372,10 @@ class DisplayModel(nn.Module):
     cuts: Tensor
     frames: Tensor
     offsets: Tensor
+    head_scale: Tensor
+    size: Tensor
+    taper: Tensor
+    exponent: Tensor
 
     def __init__(self, body: BodyModel, person: Person = Person()):
         super().__init__()
@@ -389,21 +393,26 @@ class DisplayModel(nn.Module):
             ) from error
         scale = torch.stack((girths, girths, lengths), -1)
         self._constant("size", torch.tensor([part.size for part in parts]) * scale)
-        self._constant("taper", torch.tensor([part.taper for part in parts]))
+        self._constant("taper", torch.tensor([float(part.taper) for part in parts]))
         self._constant("exponent", torch.tensor([part.exponent for part in parts]))
         self._constant("segments", torch.tensor(segments))
         self._constant("materials", torch.tensor([part.cloth for part in parts]))
         self._constant("cuts", torch.tensor([part.cut(person) for part in parts]))
-        self._constant("frames", torch.stack([_frame(torch.tensor(part.axis)) for part in parts]))
+        self._constant(
+            "frames", torch.stack([_frame(torch.tensor(part.axis, dtype=torch.float32)) for part in parts])
+        )
         self._constant("offsets", torch.tensor([part.start for part in parts]) * lengths[:, None])
-        self.head_scale = size["neck"], size["head_girth"]
+        head = torch.tensor([size["head_girth"], size["neck"], size["head_girth"]])
+        self._constant(
+            "head_scale", head
+        )  # across, along and across the head: what a face at size 1 is stretched by
 
     def _constant(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
 
     @property
     def shapes(self) -> Superquadric:
-        return Superquadric(self.size, self.taper, self.exponent)  # type: ignore[arg-type]
+        return Superquadric(self.size, self.taper, self.exponent)
 
     def forward(self, posed: PosedBody) -> PosedParts:
         """Carry the parts along with the rigid bodies."""

@@ -1,0 +1,1 @@
+"""Synthesis: drawn people, how they move, and stereo recordings of them with exact truth."""

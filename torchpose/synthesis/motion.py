@@ -1,0 +1,385 @@
+"""How people move: the eight activities of the thesis (T. 5.3), free motion and a demonstration, as poses
+over time.
+
+Left-camera frame (x right, y down, z forward); metres, radians, seconds. Left and right are the subject's.
+Every take is drawn from random streams named after the person and the take, so it does not depend on what was
+drawn before it.
+"""
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchpose.body.model import BodyModel, PosedBody
+from torchpose.geometry import exp_rotation
+from torchpose.vision.camera import StereoCamera
+
+ACTIVITIES = (
+    "left_hand",
+    "right_hand",
+    "both_hands",
+    "boxing",
+    "left_leg",
+    "right_leg",
+    "walking",
+    "sitting",
+)
+MOTIONS = (*ACTIVITIES, "free", "demo")
+LEFT, RIGHT = 0, 1
+AHEAD = math.pi / 2  # azimuth of a limb that is raised straight ahead; 0: outward to its own side
+
+
+def random_stream(*names: int | str) -> torch.Generator:
+    """A generator of its own for whatever is named, the same on every machine and in any order of calls."""
+    digest = hashlib.sha256(repr(names).encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") % 2**63)
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    heading: float = 0.61  # rad, the most that a person turns away from facing the camera: 35 degrees
+    period: tuple[float, float] = (1.4, 2.6)  # s, of one repetition
+    distance: tuple[float, float] = (2.5, 3.5)  # m, where people stand; further off if they would not fit
+    aside: float = 0.15  # m, the most to the left or right of the camera's axis
+    floor: float = 1.1  # m below the camera
+
+    def __post_init__(self) -> None:
+        for name in ("period", "distance"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise ValueError(f"{name} must be a positive range, low to high, got {low} to {high}")
+
+
+class _Draw:
+    """Numbers about a person or a take, one after the other from a stream."""
+
+    def __init__(self, *names: int | str):
+        self.generator = random_stream(*names)
+
+    def __call__(self, low: float, high: float) -> float:
+        return low + (high - low) * torch.rand((), generator=self.generator).item()
+
+    def drift(self, times: Tensor, amplitude: float, fastest: float = 0.5) -> Tensor:
+        """A slow, smooth wandering about 0, at most `amplitude`: three sines up to `fastest` Hz."""
+        waves = [torch.sin(math.tau * (self(0.1, fastest) * times + self(0, 1))) for _ in range(3)]
+        return amplitude / 3 * (waves[0] + waves[1] + waves[2])
+
+
+@dataclass(frozen=True)
+class _Figure:
+    """How the limbs are held, without the place. A limb is raised by an angle from hanging, towards an
+    azimuth.
+
+    Arms are given in the trunk's frame, legs in the upright frame that faces where the person faces: the
+    trunk may lean and turn above planted feet.
+    """
+
+    arms: Float[Tensor, "2 4 time"]  # left, right: the upper arm's raise and azimuth, the forearm's
+    legs: Float[Tensor, "2 4 time"]  # left, right: the thigh's raise and azimuth, the shank's
+    trunk: Float[Tensor, "3 time"]  # turn (to the right, seen by the person), lean forward, tilt to the left
+    head: Float[Tensor, "2 time"]  # nod, tilt to the left
+    planted: bool = (
+        True  # the lower foot keeps its place; else the hips do, and the feet slide as on a treadmill
+    )
+    leader: float = 0.0  # m by which the left foot may count as lower than it is (negative: the right one)
+
+
+_Act = Callable[[_Draw, _Draw, Tensor, float], _Figure]
+
+
+def _directions(angles: Float[Tensor, "2 4 time"]) -> Float[Tensor, "2 2 time 3"]:
+    """Unit vectors (side, limb) of raises and azimuths; x to the person's left, y down, z backward."""
+    rise, azimuth = angles[:, 0::2], angles[:, 1::2]
+    out = torch.tensor([1.0, -1.0])[:, None, None].to(angles)
+    return torch.stack((out * rise.sin() * azimuth.cos(), rise.cos(), -rise.sin() * azimuth.sin()), -1)
+
+
+def _standing(draw: _Draw, times: Tensor) -> _Figure:
+    """A person who stands at ease, never quite still."""
+
+    def held(rows: list[float], amplitude: float) -> Tensor:
+        return torch.stack([value + draw.drift(times, amplitude) for value in rows])
+
+    arm = [draw(0.08, 0.18), draw(0.3, 0.8), draw(0.15, 0.35), draw(0.9, 1.4)]
+    leg = [draw(0.03, 0.09), draw(0.1, 0.6), draw(0.0, 0.05), draw(0.1, 0.6)]
+    return _Figure(
+        arms=torch.stack([held(arm, 0.05), held(arm, 0.05)]),
+        legs=torch.stack([held(leg, 0.01), held(leg, 0.01)]),
+        trunk=held([0.0, draw(-0.03, 0.06), 0.0], 0.03),
+        head=held([draw(-0.1, 0.15), 0.0], 0.08),
+    )
+
+
+def _repetition(draw: _Draw, times: Tensor, period: float) -> Float[Tensor, " time"]:
+    """Phase (rad) of a repeated movement: a person's tempo wanders a little."""
+    return math.tau * (times / (period * draw(0.92, 1.08)) + draw(0, 1)) + draw.drift(times, 0.35)
+
+
+def _up_and_down(phase: Float[Tensor, " time"]) -> Float[Tensor, " time"]:
+    """0 at the bottom, 1 at the top, with rests at both ends."""
+    wave = (1 - phase.cos()) / 2
+    return wave * wave * (3 - 2 * wave)
+
+
+def _raise_hands(sides: tuple[int, ...]) -> _Act:
+    def act(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+        figure = _standing(take, times)
+        top, azimuth, bend = style(2.25, 2.75), style(0.35, 1.35), style(0.1, 0.9)
+        phase = _repetition(take, times, period)
+        for side in sides:
+            lift = _up_and_down(phase + take(-0.25, 0.25)) * (1 + take.drift(times, 0.05)) * take(0.92, 1.0)
+            hanging = figure.arms[side].clone()
+            figure.arms[side, 0] = hanging[0] + (top - hanging[0]) * lift
+            figure.arms[side, 1] = azimuth + take(-0.15, 0.15)
+            flexion = hanging[2] - hanging[0] + 4 * bend * lift * (1 - lift)  # the elbow bends on the way
+            figure.arms[side, 2] = figure.arms[side, 0] + flexion
+            figure.arms[side, 3] = figure.arms[side, 1] + (hanging[3] - figure.arms[side, 1]) * (1 - lift)
+        return figure
+
+    return act
+
+
+def _box(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    figure = _standing(take, times)
+    guard = torch.tensor([style(0.35, 0.7), style(0.7, 1.1), style(2.1, 2.5), style(1.6, 1.9)])
+    punch = torch.tensor([style(1.3, 1.5), style(1.35, 1.5), style(1.4, 1.6), style(1.5, 1.7)])
+    phase = _repetition(take, times, period / 1.3)
+    reach = []
+    for side in (LEFT, RIGHT):
+        wave = (1 + (phase + math.pi * side + take(-0.2, 0.2)).cos()) / 2
+        reach.append(wave * wave * take(0.88, 1.0))
+        angles = guard[:, None] + (punch - guard)[:, None] * reach[side]
+        figure.arms[side] = angles + 0.6 * (figure.arms[side] - figure.arms[side].mean(-1, keepdim=True))
+    figure.trunk[0] += style(0.1, 0.3) * (reach[LEFT] - reach[RIGHT])
+    figure.trunk[1] += style(0.02, 0.15)
+    return figure
+
+
+def _raise_leg(side: int) -> _Act:
+    def act(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+        figure = _standing(take, times)
+        lift = _up_and_down(_repetition(take, times, period)) * (1 + take.drift(times, 0.05))
+        top, knee, azimuth = style(0.85, 1.35), style(0.65, 1.1), style(1.3, 1.5)
+        figure.legs[side, 0] += top * take(0.92, 1.0) * lift
+        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * lift
+        figure.legs[side, 2] += top * (1 - knee) * lift
+        figure.legs[side, 3] = azimuth
+        figure.arms[:, 0] += style(0.0, 0.2) * lift  # for balance
+        figure.trunk[1] -= style(0.0, 0.08) * lift
+        return figure
+
+    return act
+
+
+def _walk(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    figure = _standing(take, times)
+    phase = _repetition(take, times, period / 1.6)
+    stride, swing, knee, bend = style(0.28, 0.42), style(0.25, 0.5), style(0.75, 1.1), style(0.2, 0.6)
+    for side in (LEFT, RIGHT):
+        own = phase + math.pi * side
+        thigh = 0.1 + stride * own.sin()
+        flexion = (
+            0.08 + knee * ((1 + (own + 0.25).cos()) / 2) ** 2
+        )  # the knee bends while the leg swings forward
+        figure.legs[side, 0], figure.legs[side, 1] = thigh, AHEAD - 0.03
+        figure.legs[side, 2], figure.legs[side, 3] = thigh - flexion, AHEAD - 0.03
+        arm = -swing * take(0.9, 1.1) * own.sin()
+        figure.arms[side, 0], figure.arms[side, 1] = arm, AHEAD - 0.1
+        figure.arms[side, 2], figure.arms[side, 3] = arm + bend * (1 - 0.3 * own.sin()), AHEAD
+    figure.trunk[0] -= style(0.02, 0.08) * phase.sin()
+    figure.trunk[1] += style(0.0, 0.06)
+    return replace(figure, planted=False)
+
+
+def _sit(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    figure = _standing(take, times)
+    down = _up_and_down(_repetition(take, times, 1.3 * period))
+    thigh, shank, spread = style(1.25, 1.5), style(0.1, 0.25), style(1.3, 1.5)
+    hands, reach = style(0.3, 0.8), style(0.4, 0.9)
+    for side in (LEFT, RIGHT):
+        figure.legs[side, 0] += (thigh - figure.legs[side, 0]) * down
+        figure.legs[side, 1] += (spread - figure.legs[side, 1]) * down
+        figure.legs[side, 2] -= shank * down
+        figure.legs[side, 3] = AHEAD
+        figure.arms[side, 0] += (hands * take(0.9, 1.1) - figure.arms[side, 0]) * down
+        figure.arms[side, 1] += (AHEAD - 0.2 - figure.arms[side, 1]) * down
+        figure.arms[side, 2] += reach * down
+    figure.trunk[1] += 4 * style(0.08, 0.14) * down * (1 - down) + style(0.0, 0.15) * down
+    return figure
+
+
+def _move_freely(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    figure = _standing(take, times)
+    pace = 1 / period
+    for side in (LEFT, RIGHT):
+        rise = 1.0 + take.drift(times, 0.95, pace)
+        figure.arms[side, 0] = rise
+        figure.arms[side, 1] = take(0.5, 1.1) + take.drift(times, 0.5, pace)
+        figure.arms[side, 2] = rise + 0.8 + take.drift(times, 0.75, pace)
+        figure.arms[side, 3] = figure.arms[side, 1] + take.drift(times, 0.5, pace)
+    # One foot stands while the other is lifted a little.
+    balance = take.drift(times, 1.0, pace)
+    for side in (LEFT, RIGHT):
+        lift = _smooth(balance if side == LEFT else -balance) * take(0.5, 0.9)
+        figure.legs[side, 0] += lift
+        figure.legs[side, 1] += (AHEAD - take(0, 0.5) - figure.legs[side, 1]) * (lift / (lift + 0.05))
+        figure.legs[side, 2] -= 0.3 * lift
+        figure.legs[side, 3] = AHEAD
+    figure.trunk[:] += torch.stack([take.drift(times, amplitude, pace) for amplitude in (0.35, 0.15, 0.1)])
+    figure.head[:] += torch.stack([take.drift(times, 0.25, pace), take.drift(times, 0.2, pace)])
+    return figure
+
+
+def _demonstrate(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    """Both hands go up, and down again to the sides; then a step forward with the left leg. 2.5 seconds."""
+    figure = _standing(take, times)
+    up = _smooth(times / 0.9) * (1 - _smooth((times - 1.0) / 0.8))
+    for side in (LEFT, RIGHT):
+        figure.arms[side, 0] += 2.35 * up
+        figure.arms[side, 1] = 0.45 + 0.15 * side
+        figure.arms[side, 2] += 2.5 * up
+        figure.arms[side, 3] += (0.6 - figure.arms[side, 3]) * up
+    lift, step = _bump((times - 1.5) / 0.8), _smooth((times - 1.6) / 0.8)
+    figure.legs[LEFT, 0] += 0.75 * lift + 0.26 * step
+    figure.legs[LEFT, 2] += 0.22 * step - 0.15 * lift
+    figure.legs[RIGHT, 0] -= 0.22 * step
+    figure.legs[RIGHT, 2] -= 0.24 * step
+    figure.legs[:, 1::2] = AHEAD - 0.25
+    figure.arms[LEFT, 0] -= 0.2 * step
+    figure.arms[RIGHT, 2] += 0.35 * step
+    return replace(figure, leader=-1.0)
+
+
+def _smooth(x: Tensor) -> Tensor:
+    """From 0 to 1 as x does, without corners; 0 before, 1 after."""
+    x = x.clamp(0, 1)
+    return x * x * x * (10 - 15 * x + 6 * x * x)
+
+
+def _bump(x: Tensor) -> Tensor:
+    """Up and down again while x goes from 0 to 1, without corners; 0 outside."""
+    return torch.sin(math.pi * x.clamp(0, 1)) ** 2
+
+
+_ACTS: dict[str, _Act] = {
+    "left_hand": _raise_hands((LEFT,)),
+    "right_hand": _raise_hands((RIGHT,)),
+    "both_hands": _raise_hands((LEFT, RIGHT)),
+    "boxing": _box,
+    "left_leg": _raise_leg(LEFT),
+    "right_leg": _raise_leg(RIGHT),
+    "walking": _walk,
+    "sitting": _sit,
+    "free": _move_freely,
+    "demo": _demonstrate,
+}
+
+
+def perform(
+    body: BodyModel,
+    size: Float[Tensor, "1 sizes"],
+    motion: str,
+    times: Float[Tensor, " time"],
+    camera: StereoCamera,
+    person: int = 0,
+    take: int = 0,
+    config: MotionConfig = MotionConfig(),
+) -> Float[Tensor, "time parameters"]:
+    """The poses of one take of a motion (one of `MOTIONS`) at `times` (s), within the body's limits.
+
+    `person` decides the style (how high, in which plane, how bent), `take` the tempo, phase, heading and
+    place. The whole person, hands up, is in the camera's view; where, does not depend on the motion. Raises
+    ValueError for an unknown motion.
+    """
+    if motion not in _ACTS:
+        raise ValueError(f"the motion must be one of {', '.join(MOTIONS)}, got {motion!r}")
+    times = times.to(size)
+    style, draw = _Draw("style", motion, person), _Draw("take", motion, person, take)
+    place = _Draw("place", person, take, motion)
+    figure = _ACTS[motion](style, draw, times, place(*config.period))
+    heading = 0.25 * place(-1, 1) if motion == "demo" else config.heading * place(-1, 1)
+    turn, lean, tilt = figure.trunk
+    nod, aslant = figure.head
+    leaning = exp_rotation(_along(1, turn)) @ exp_rotation(_along(0, lean)) @ exp_rotation(_along(2, tilt))
+    arms = (
+        _directions(figure.arms).permute(2, 0, 1, 3).flatten(1, 2)
+    )  # (T, left and right upper arm and forearm, 3)
+    legs = _directions(figure.legs).permute(2, 0, 1, 3).flatten(1, 2) @ leaning  # rows: R^T d
+    head = torch.stack((aslant.sin(), -aslant.cos() * nod.cos(), -aslant.cos() * nod.sin()), -1)
+    directions = torch.cat((head[:, None], arms, legs), 1)
+    angles = torch.stack((heading + turn, lean, tilt), -1)
+    pose = body.pose_from_directions(torch.zeros_like(angles), angles, directions)
+    pose = torch.maximum(torch.minimum(pose, body.high), body.low)
+    near, far = _distances(body, size, camera, config)
+    spot = torch.tensor([config.aside * place(-1, 1), place(near, far)]).to(size)
+    return torch.cat((_stand(body, size, pose, figure, heading, spot, config.floor), pose[:, 3:]), -1)
+
+
+def _along(axis: int, angle: Float[Tensor, " time"]) -> Float[Tensor, "time 3"]:
+    return angle[:, None] * F.one_hot(torch.tensor(axis, device=angle.device), 3)
+
+
+def _stand(
+    body: BodyModel,
+    size: Float[Tensor, "1 sizes"],
+    pose: Float[Tensor, "time parameters"],
+    figure: _Figure,
+    heading: float,
+    spot: Float[Tensor, "2"],
+    floor: float,
+) -> Float[Tensor, "time 3"]:
+    """Where the root must be for the lower foot to stand on the floor and to keep its place there, x and z at
+    `spot`.
+    """
+    posed = body(pose, size)
+    soles = lowest(body, posed)  # (T, 2)
+    height = floor - 0.004 * torch.logsumexp(soles / 0.004, -1)  # a maximum without a corner
+    if not figure.planted:
+        return torch.stack((spot[0].expand_as(height), height, spot[1].expand_as(height)), -1)
+    bears = torch.softmax((soles + soles.new_tensor([figure.leader, -figure.leader]) / 2) / 0.03, -1)
+    upright = body(
+        torch.cat((pose.new_tensor([[0, 0, 0, heading, 0, 0]]), body.rest[None].to(pose)), -1), size
+    )
+    hips = _joints(body, upright, "hip")[..., 0::2]  # above where each foot stands at ease
+    feet = _joints(body, posed, "ankle")[..., 0::2]
+    across = spot + (bears[..., None] * (hips - feet)).sum(1)
+    return torch.stack((across[:, 0], height, across[:, 1]), -1)
+
+
+def lowest(body: BodyModel, posed: PosedBody) -> Float[Tensor, "batch 2"]:
+    """Height (y, m) of the lowest point of the left and right foot's spheroid: the sole."""
+    feet = [body.segment_names.index(name) for name in ("foot_left", "foot_right")]
+    across, along = posed.radii[:, feet].unbind(-1)
+    down = posed.frames[:, feet, 1]  # the spheroid's axes, as far as they point down
+    return posed.centers[:, feet, 1] + (down * torch.stack((across, across, along), -1)).norm(dim=-1)
+
+
+def _joints(body: BodyModel, posed: PosedBody, name: str) -> Float[Tensor, "batch 2 3"]:
+    return posed.joints[:, [body.joint_names.index(f"{name}_{side}") for side in ("left", "right")]]
+
+
+def _distances(
+    body: BodyModel, size: Float[Tensor, "1 sizes"], camera: StereoCamera, config: MotionConfig
+) -> tuple[float, float]:
+    """The range of distances at which this person, with raised hands and a foot put forward, is wholly in
+    view.
+    """
+    up, down = size.new_tensor([0, -1, 0]), size.new_tensor([0, 1, 0])
+    limbs = torch.stack((up, up, up, up, up, down, down, down, down))[None]
+    zero = size.new_zeros(1, 3)
+    posed = body(body.pose_from_directions(zero, zero, limbs), size)
+    hand = body.segment_names.index("hand_left")
+    tip = (posed.centers[0, hand, 1] - posed.radii[0, hand, 1]).item()
+    above = (lowest(body, posed).amax().item() - tip) - config.floor
+    room_above, room_below = (camera.cy + 0.5) * 0.98, (camera.height - camera.cy - 0.5) * 0.98
+    fits = max(
+        above * camera.focal_length / room_above, config.floor * camera.focal_length / room_below + 0.25
+    )
+    low, high = config.distance
+    return max(low, fits), max(high, fits + 0.2)
