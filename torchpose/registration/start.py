@@ -28,8 +28,13 @@ ARMS = (
     ((0.2, 0.9, -0.4), (-0.2, -0.8, -0.7)),
     ((0.3, 0.6, -0.8), (-0.2, 0.3, -0.9)),
 )
-# The same for thigh and shank: standing and sitting.
-LEGS = (((0.08, 1.0, -0.03), (0.05, 1.0, 0.03)), ((0.2, 0.25, -1.0), (0.1, 1.0, 0.0)))
+# The same for thigh and shank: standing, sitting or knee raised, stepping back, to the side.
+LEGS = (
+    ((0.08, 1.0, -0.03), (0.05, 1.0, 0.03)),
+    ((0.2, 0.25, -1.0), (0.1, 1.0, 0.0)),
+    ((0.1, 0.9, 0.3), (0.05, 0.6, 0.8)),
+    ((0.6, 0.8, -0.2), (0.2, 1.0, 0.0)),
+)
 
 
 @dataclass(frozen=True)
@@ -67,22 +72,37 @@ class Starter(nn.Module):
     def forward(
         self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
     ) -> Registration:
-        """Register one frame (batch 1) without a known pose.
+        """Register one frame (batch 1) without a known pose."""
+        return self._search(observation, self.hypotheses(observation, faces, size), size, self.config.sigma)
 
-        Every start is fitted on a few points; of the best heading the arms are exchanged in all pairs, and the best few
-        combinations are fitted on all points. The registration with the least misfit is returned.
-        """
-        starts = self.hypotheses(observation, faces, size)
+    def refresh(
+        self, observation: Observation, pose: Float[Tensor, "1 parameters"], size: Float[Tensor, "#batch sizes"]
+    ) -> Registration:
+        """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
+        return self._search(observation, self.variations(pose), size, self.registrar.config.sigma_first)
+
+    def _search(
+        self,
+        observation: Observation,
+        starts: Float[Tensor, "starts parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        sigma: float,
+    ) -> Registration:
+        """Every start is fitted on a few points, the limbs of the good ones are exchanged in all pairs, and the best
+        few combinations are fitted on all points. The registration with the least misfit is returned."""
         few = _thin(observation, self.config.points)
-        rough = self.coarse(few, starts, size, rounds=self.config.rounds, sigma_first=self.config.sigma)
-        misfit = rough.misfit + self.config.back_penalty * self._turned_away(rough.pose)
-        combined = torch.cat([rough.pose, self._exchange_arms(rough.pose, misfit)])
+        rough = self.coarse(few, starts, size, rounds=self.config.rounds, sigma_first=sigma)
+        misfit = self._score(rough)
+        arms = self._exchange(rough.pose, misfit, ("upper_arm", "forearm"))
+        legs = self._exchange(rough.pose, misfit, ("thigh", "shank"))
+        combined = torch.cat([rough.pose, arms, legs])
         again = self.coarse(few, combined, size, rounds=1, sigma_first=self.registrar.config.sigma_last)
-        score = again.misfit + self.config.back_penalty * self._turned_away(again.pose)
-        best = score.topk(min(self.config.finalists, len(score)), largest=False).indices
+        best = self._score(again).topk(min(self.config.finalists, len(combined)), largest=False).indices
         final = self.registrar(observation, again.pose[best], size, rounds=self.config.final_rounds)
-        score = final.misfit + self.config.back_penalty * self._turned_away(final.pose)
-        return select(final, score.argmin())
+        return select(final, self._score(final).argmin())
+
+    def _score(self, found: Registration) -> Float[Tensor, " starts"]:
+        return found.misfit + self.config.back_penalty * self._turned_away(found.pose)
 
     def hypotheses(
         self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
@@ -100,19 +120,36 @@ class Starter(nn.Module):
         pelvis = pelvis_position(observation.cloud, faces, size, self.body).expand(Y * L, 3)
         return self.body.pose_from_directions(pelvis, root, directions.repeat(Y, 1, 1))
 
-    def _exchange_arms(
-        self, pose: Float[Tensor, "starts parameters"], misfit: Float[Tensor, " starts"]
+    def variations(self, pose: Float[Tensor, "1 parameters"]) -> Float[Tensor, "starts parameters"]:
+        """A pose, and that pose with one limb at a time in each of its other places."""
+        now = self.body.limb_directions(self.body(pose))
+        names = self.body.body_names[1:]
+        rows = [now]
+        for upper, lower, places in (("upper_arm", "forearm", ARMS), ("thigh", "shank", LEGS)):
+            for side, mirror in (("_left", 1.0), ("_right", -1.0)):
+                for place in places:
+                    row = now.clone()
+                    aim = torch.nn.functional.normalize(torch.tensor(place).to(row), dim=-1)
+                    aim = aim * torch.tensor([mirror, 1.0, 1.0]).to(row)
+                    row[0, names.index(upper + side)], row[0, names.index(lower + side)] = aim
+                    rows.append(row)
+        directions = torch.cat(rows)
+        root = pose.expand(len(directions), -1)
+        return self.body.pose_from_directions(root[:, :3], root[:, 3:6], directions)
+
+    def _exchange(
+        self, pose: Float[Tensor, "starts parameters"], misfit: Float[Tensor, " starts"], limb: tuple[str, str]
     ) -> Float[Tensor, "combinations parameters"]:
-        """The best start with each left arm and each right arm of the eight best starts."""
+        """The best start with each left and each right limb of the eight best starts."""
         names = self.body.parameter_names
-        arms = [
-            [i for i, name in enumerate(names) if name.startswith(("upper_arm" + side, "forearm" + side))]
+        sides = [
+            [i for i, name in enumerate(names) if name.startswith((limb[0] + side, limb[1] + side))]
             for side in ("_left", "_right")
         ]
         order = misfit.argsort()[:8]
         left, right = (part.flatten() for part in torch.meshgrid(order, order, indexing="ij"))
         combined = pose[order[:1]].repeat(len(left), 1)
-        for index, chosen in zip(arms, (left, right), strict=True):
+        for index, chosen in zip(sides, (left, right), strict=True):
             combined[:, index] = pose[chosen][:, index]
         return combined
 

@@ -1,0 +1,1 @@
+"""Following people through a recording."""

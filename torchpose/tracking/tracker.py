@@ -1,0 +1,146 @@
+"""One person through a recording: prediction, registration, loss and recovery, frame after frame.
+
+Times are in seconds, poses in metres and radians. The next frame starts from the last (T. 3.2.2).
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchpose.body.model import BodyModel
+from torchpose.registration.fitting import PosePrior
+from torchpose.registration.start import Starter, select
+from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
+from torchpose.vision.faces import Faces
+
+
+class TrackStatus(Enum):
+    """What a frame says of the person; only the last four of these words come with a pose, `lost` without."""
+
+    absent = "absent"  # nobody is there
+    entering = "entering"  # somebody is there, of whom no pose could be found yet
+    lost = "lost"  # somebody was tracked, and no pose fits this frame
+    tracked = "tracked"
+    partial = "partial"  # tracked, but cut by the image's border
+    recovered = "recovered"  # found anew after a loss or a jump
+
+
+ANSWERED = (TrackStatus.tracked, TrackStatus.partial, TrackStatus.recovered)
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    velocity: float = 0.8  # share of the last velocity that the prediction keeps; 0 starts from the last pose
+    joint_speed_sd: float = 8.0  # rad/s by which a joint departs from the prediction
+    root_speed_sd: float = 2.0  # m/s and rad/s, the same for the root
+    accept_misfit: float = 0.040  # m: a pose that fits worse is none
+    stray_distance: float = 0.08  # m from the model, from which a point strays from it
+    stray_share: float = 0.03  # of the points straying: a limb may be lost, and is sought elsewhere
+    memory: float = 2.0  # s after which a lost person is forgotten
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.velocity <= 1:
+            raise ValueError(f"velocity must be between 0 and 1, got {self.velocity}")
+        for name in ("joint_speed_sd", "root_speed_sd", "accept_misfit", "stray_distance", "stray_share", "memory"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """A frame's answer: no registration unless the status is one of `ANSWERED`."""
+
+    status: TrackStatus
+    registration: Registration | None
+
+
+class Tracker(nn.Module):
+    """Holds one person's recent past. Frames come in order, through `forward`."""
+
+    def __init__(self, body: BodyModel, config: TrackingConfig, registrar: Registrar, starter: Starter):
+        super().__init__()
+        self.body = body
+        self.config = config
+        self.registrar = registrar
+        self.starter = starter
+        self.forget()
+
+    def forget(self) -> None:
+        """Start as if no frame had been seen."""
+        self._pose: Tensor | None = None
+        self._velocity: Tensor | None = None  # per second
+        self._time = 0.0
+
+    def forward(
+        self,
+        time_s: float,
+        observation: Observation | None,
+        faces: Faces | None,
+        size: Float[Tensor, "#batch sizes"],
+        cut: bool = False,
+    ) -> TrackedFrame:
+        """The person's pose at `time_s`.
+
+        Args:
+            observation: the frame, batch 1; None where nobody is seen.
+            faces: of the same frame, for a cold start.
+            cut: the silhouette meets the image's border, so part of the person may lie outside.
+        """
+        if self._pose is not None and time_s - self._time > self.config.memory:
+            self.forget()
+        if observation is None or faces is None:
+            return TrackedFrame(TrackStatus.absent, None)
+        if self._pose is None:
+            found = self.starter(observation, faces, size)
+            if not self._acceptable(found):
+                return TrackedFrame(TrackStatus.entering, None)
+            self._remember(found, time_s)
+            return TrackedFrame(TrackStatus.partial if cut else TrackStatus.tracked, found)
+        status = TrackStatus.partial if cut else TrackStatus.tracked
+        found = self._follow(observation, size, time_s)
+        if self._doubtful(found):
+            # First the limbs: where one moved too fast to follow, its points are there without a part.
+            better = self.starter.refresh(observation, found.pose, size)
+            if is_finite(better)[0] and better.misfit < found.misfit:
+                found = better
+        if not self._acceptable(found):
+            anew = self.starter(observation, faces, size)
+            if self._acceptable(anew):
+                found, status = anew, TrackStatus.recovered
+                self._velocity = None
+        if not self._acceptable(found):
+            return TrackedFrame(TrackStatus.lost, None)
+        self._remember(found, time_s)
+        return TrackedFrame(status, found)
+
+    def _follow(
+        self, observation: Observation, size: Float[Tensor, "#batch sizes"], time_s: float
+    ) -> Registration:
+        """Register from the prediction and from the last pose, and keep what fits better."""
+        assert self._pose is not None
+        elapsed = max(time_s - self._time, 1e-3)
+        predicted = self._pose
+        if self._velocity is not None:
+            predicted = self._pose + self.config.velocity * elapsed * self._velocity
+        sd = torch.full_like(predicted, self.config.joint_speed_sd * elapsed)
+        sd[:, :6] = self.config.root_speed_sd * elapsed
+        starts = torch.cat([predicted, self._pose])
+        prior = PosePrior(predicted.expand_as(starts), (sd**-2).expand_as(starts))
+        both = self.registrar(observation, starts, size, prior)
+        return select(both, both.misfit.argmin())
+
+    def _doubtful(self, found: Registration) -> bool:
+        points = (found.distance > 0).sum().clamp_min(1)
+        stray = (found.distance > self.config.stray_distance).sum() / points
+        return float(stray) > self.config.stray_share or not self._acceptable(found)
+
+    def _acceptable(self, found: Registration) -> bool:
+        return bool(is_finite(found)[0]) and float(found.misfit) < self.config.accept_misfit
+
+    def _remember(self, found: Registration, time_s: float) -> None:
+        if self._pose is not None and time_s > self._time:
+            self._velocity = (found.pose - self._pose) / (time_s - self._time)
+        self._pose, self._time = found.pose, time_s
