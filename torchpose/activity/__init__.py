@@ -1,5 +1,6 @@
 """The activity column: sequences of features in, activities out (T. 4.2 to 4.4).
 
-`dataset` (clips, splits), `skeleton` and `subspace` (what features are computed from), `features`, `codebook`,
-`inference` and `hmm`, `recognizer`. It imports nothing of the pose column: the two meet in `Clip`.
+In the order of their imports: `dataset` (clips, splits), `skeleton` and `subspace` (what features are made
+of), `features`, `inference`, `hmm`, `codebook`, `recognizer`. Nothing of the pose column is imported: the two
+columns meet in `Clip`.
 """

@@ -183,7 +183,7 @@ class SkeletonFeature(Feature):
 
 
 class VelocityFeature(Feature):
-    """Another feature with its change over 2 x `step` frames appended, or over as many as there are at the ends.
+    """Another feature with its change over 2 x `step` frames appended; at the ends over those that there are.
 
     A frame whose partner was lost counts as lost too.
     """

@@ -66,10 +66,12 @@ def _shift(values: Tensor, offset: int, dim: int = 0) -> Tensor:
 
 def _log_sum(terms: list[Tensor]) -> Tensor:
     """log of the sum of exponentials."""
-    # logaddexp takes half the time on such small tensors; its gradient is NaN where all are minus infinity.
-    if torch.is_grad_enabled():
-        return torch.logsumexp(torch.stack(terms), dim=0)
-    return reduce(torch.logaddexp, terms)
+    if not torch.is_grad_enabled():
+        return reduce(torch.logaddexp, terms)  # half the time of logsumexp on tensors this small
+    stacked = torch.stack(terms)
+    # All minus infinity would give a NaN gradient, and both branches of `where` are differentiated: hence 0.
+    possible = ~torch.isneginf(stacked).all(0)
+    return torch.where(possible, torch.logsumexp(torch.where(possible, stacked, 0.0), dim=0), -torch.inf)
 
 
 def _predict(

@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from yaml import YAMLError
 
 from torchpose.activity.codebook import Codebook, CodebookConfig
 from torchpose.activity.dataset import Clip
@@ -51,7 +52,7 @@ class RecognizerConfig:
 
 @dataclass(frozen=True)
 class Recognition:
-    """What the sequences are (4.16). Scores are NaN where nothing was observed."""
+    """What the sequences are (4.16). NaN: nothing was observed; for the odds, or no model is possible."""
 
     log_likelihood: Float[Tensor, "sequences activities"]  # nats per observed frame
     activity: Int[Tensor, " sequences"]  # the most likely, -1 where there is no answer
@@ -95,7 +96,7 @@ class Evaluation:
 
 
 class Recognizer(nn.Module):
-    """Clips in, activities out.
+    """Clips in, activities out; the clips' tensors and the module are on one device.
 
     >>> recognizer = Recognizer(RecognizerConfig()).fit(training_clips)
     >>> recognizer(clips).activity
@@ -226,7 +227,7 @@ class Recognizer(nn.Module):
             config = OmegaConf.to_object(merged)
             activities, digest = tuple(settings.activities), settings.weights_sha256
             weights = load_file(folder / _WEIGHTS)
-        except (OmegaConfBaseException, SafetensorError, AttributeError, TypeError) as error:
+        except (OmegaConfBaseException, YAMLError, SafetensorError, AttributeError, TypeError) as error:
             raise ValueError(f"the recogniser in {folder} cannot be read: {error}; train it again") from error
         if hashlib.sha256((folder / _WEIGHTS).read_bytes()).hexdigest() != digest:
             raise ValueError(

@@ -76,7 +76,7 @@ def _extent(
 def _overlap(
     near: Float[Tensor, " frames"], far: Float[Tensor, " frames"], cells: int, pixels: int
 ) -> Float[Tensor, "frames cells pixels"]:
-    """Weights that average pixels into equal cells from `near` to `far`: the share each pixel has of a cell."""
+    """Weights that average pixels into equal cells from `near` to `far`: each pixel's share of a cell."""
     size = ((far - near) / cells)[:, None, None]
     start = near[:, None, None] + size * torch.arange(cells, device=near.device, dtype=near.dtype)[:, None]
     pixel = torch.arange(pixels, device=near.device, dtype=near.dtype)

@@ -1,0 +1,428 @@
+"""The HMM against the sum over all its paths, hmmlearn, and properties of EM."""
+
+import itertools
+import warnings
+
+import pytest
+import torch
+from hmmlearn.hmm import CategoricalHMM
+from torch.testing import assert_close
+
+from torchpose.activity.hmm import (
+    MISSING,
+    DiscreteHMM,
+    HMMConfig,
+    Parameters,
+    Status,
+    Topology,
+    baum_welch,
+    emission_scores,
+    equal_segments,
+    mask_padding,
+)
+from torchpose.activity.inference import hmm_backward, hmm_filter, hmm_smoother, viterbi
+
+NO_SMOOTHING = {"emission_prior": 1.0, "transition_prior": 1.0}
+
+
+def random_parameters(models, states, num_symbols, topology=Topology.ergodic):
+    """Log-parameters with structural zeros where the topology has them."""
+
+    def rows(*shape, allowed=None):
+        weights = torch.rand(*shape, dtype=torch.float64) + 0.1
+        weights = weights if allowed is None else weights * allowed
+        return (weights / weights.sum(-1, keepdim=True)).log()
+
+    start = move = None
+    if topology is Topology.left_to_right:
+        start = torch.eye(states)[0]
+        move = torch.eye(states) + torch.eye(states).roll(1, dims=1).triu()
+    return Parameters(
+        rows(models, states, allowed=start),
+        rows(models, states, states, allowed=move),
+        rows(models, states, num_symbols),
+    )
+
+
+def log_joint(log_initial, log_transition, log_emission):
+    """Every path's log p(z, y), by enumeration: the definition, and the oracle. Batch axes first."""
+    time, states = log_emission.shape[-2:]
+    paths = torch.tensor(list(itertools.product(range(states), repeat=time)))
+    prior = log_initial[..., paths[:, 0]] + log_transition[..., paths[:, :-1], paths[:, 1:]].sum(-1)
+    return paths, prior + log_emission[..., torch.arange(time), paths].sum(-1)
+
+
+def symbols_of(sequences, time, num_symbols, missing=0.0):
+    symbols = torch.randint(num_symbols, (sequences, time))
+    return torch.where(torch.rand(sequences, time) < missing, MISSING, symbols)
+
+
+SHAPES = pytest.mark.parametrize(
+    ("states", "time", "topology"),
+    [
+        (1, 3, Topology.ergodic),
+        (2, 1, Topology.ergodic),
+        (2, 6, Topology.left_to_right),
+        (3, 5, Topology.ergodic),
+        (4, 5, Topology.left_to_right),
+    ],
+)
+
+
+@SHAPES
+def test_inference_matches_enumeration(states, time, topology):
+    model = random_parameters(3, states, 5, topology)
+    scores = emission_scores(model.log_emission, symbols_of(2, time, 5, missing=0.2))  # (3, 2, T, K)
+    arguments = (model.log_initial[:, None], model.log_transition[:, None], scores)
+    paths, joint = log_joint(*arguments)  # (P, T), (3, 2, P)
+    evidence = joint.logsumexp(-1)
+    weight = (joint - evidence[..., None]).exp()
+    visits = torch.nn.functional.one_hot(paths, states).to(weight)  # (P, T, K)
+    pairs = torch.einsum("msp,pti,ptj->mstij", weight, visits[:, :-1], visits[:, 1:])
+
+    smoothed = hmm_smoother(*arguments)
+    assert_close(smoothed.log_likelihood, evidence)
+    assert_close(smoothed.states, torch.einsum("msp,ptk->mstk", weight, visits))
+    assert_close(smoothed.pairs, pairs)
+    assert_close(hmm_filter(*arguments).log_likelihood, evidence)
+
+    decoded = viterbi(*arguments)
+    assert_close(decoded.log_probability, joint.amax(-1))
+    assert_close(decoded.states, paths[joint.argmax(-1)])
+
+
+@SHAPES
+def test_filter_and_backward_see_the_past_and_the_future_only(states, time, topology):
+    model = random_parameters(2, states, 4, topology)
+    scores = emission_scores(model.log_emission, symbols_of(1, time, 4)).squeeze(1)
+    log_filtered = hmm_filter(model.log_initial, model.log_transition, scores).log_filtered
+    log_beta = hmm_backward(model.log_transition, scores)
+    for t in range(time):
+        paths, joint = log_joint(model.log_initial, model.log_transition, scores[:, : t + 1])
+        here = torch.nn.functional.one_hot(paths[:, t], states).to(joint)
+        assert_close(log_filtered[:, t].exp(), joint.softmax(-1) @ here)
+        # p(y_t+1:T | z_t = k): start in state k with nothing observed at t.
+        future = scores[:, t:].clone()
+        future[:, 0] = 0
+        for state in range(states):
+            start = torch.full((states,), -torch.inf, dtype=torch.float64)
+            start[state] = 0
+            _, joint = log_joint(start, model.log_transition, future)
+            assert_close(log_beta[:, t, state], joint.logsumexp(-1))
+
+
+def test_viterbi_stops_at_the_end_of_each_sequence():
+    model = random_parameters(1, 3, 4)
+    arguments = (model.log_initial, model.log_transition)
+    symbols, lengths = symbols_of(20, 6, 4), torch.randint(1, 7, (20,))
+    scores = emission_scores(model.log_emission, mask_padding(symbols, lengths))[0]
+    decoded = viterbi(*arguments, scores, lengths)
+    for s, length in enumerate(lengths.tolist()):
+        paths, joint = log_joint(model.log_initial[0], model.log_transition[0], scores[s, :length])
+        assert decoded.states[s, :length].tolist() == paths[joint.argmax()].tolist()
+        assert (decoded.states[s, length:] == -1).all()
+        assert_close(decoded.log_probability[s], joint.max())
+
+
+def test_a_long_sequence_stays_exact_where_scaling_would_lose_a_state():
+    """A two-state left-to-right path is known by when it leaves, so 5,000 frames can be enumerated.
+
+    For 2,000 frames the second state explains the symbols far better, by e^3200 in all: scaled probabilities
+    lose the first state. Then come symbols that only the first can emit.
+    """
+    time = 5000
+    stay = torch.tensor([[0.999, 0.001], [0.0, 1.0]], dtype=torch.float64).log()
+    start = torch.tensor([1.0, 0.0], dtype=torch.float64).log()
+    emission = torch.tensor([[0.1, 0.6, 0.3], [0.5, 1e-300, 0.5]], dtype=torch.float64)
+    symbols = torch.full((1, time), 0)
+    symbols[0, 2000:3000], symbols[0, 3000:] = 1, 2
+    scores = emission_scores(emission.log(), symbols)[0]
+
+    frames = torch.arange(time)
+    first = scores[:, 0].cumsum(0) + frames * stay[0, 0]
+    second = scores[:, 1].flip(0).cumsum(0).flip(0)
+    leaves = first[:-1] + stay[0, 1] + second[1:]
+    joint = torch.cat([leaves, first[-1:]])
+    assert_close(hmm_filter(start, stay, scores).log_likelihood, joint.logsumexp(0), rtol=1e-12, atol=0)
+    decoded = viterbi(start, stay, scores)
+    assert_close(decoded.log_probability, joint.max(), rtol=1e-12, atol=0)
+    assert decoded.states.sum() == time - 1 - joint.argmax()
+    smoothed = hmm_smoother(start, stay, scores)
+    assert smoothed.states.isfinite().all()
+    assert_close(smoothed.states.sum(-1), torch.ones(time, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("topology", list(Topology))
+def test_gradient_of_the_likelihood_is_the_posterior(topology):
+    model = random_parameters(2, 3, 4, topology)
+    scores = emission_scores(model.log_emission, symbols_of(1, 6, 4)).squeeze(1).requires_grad_()
+    filtered = hmm_filter(model.log_initial, model.log_transition, scores)
+    (gradient,) = torch.autograd.grad(filtered.log_likelihood.sum(), scores)
+    assert_close(gradient, hmm_smoother(model.log_initial, model.log_transition, scores).states)
+    assert torch.autograd.gradcheck(
+        lambda x: hmm_filter(model.log_initial, model.log_transition, x).log_likelihood, scores
+    )
+
+
+def test_the_faster_sum_without_gradients_is_the_same():
+    model = random_parameters(2, 4, 4, Topology.left_to_right)
+    scores = emission_scores(model.log_emission, symbols_of(3, 9, 4, missing=0.2))
+    arguments = (model.log_initial[:, None], model.log_transition[:, None], scores)
+    with_gradients = hmm_smoother(*arguments)
+    with torch.no_grad():
+        without = hmm_smoother(*arguments)
+    assert_close(without.log_likelihood, with_gradients.log_likelihood, rtol=1e-13, atol=0)
+    assert_close(without.pairs, with_gradients.pairs, rtol=1e-11, atol=0)
+
+
+def test_a_missing_symbol_is_summed_over():
+    model = random_parameters(1, 3, 4)
+    symbols = torch.tensor([[1, MISSING, 2, 0]])
+    every = symbols.repeat(4, 1)
+    every[:, 1] = torch.arange(4)
+
+    def evidence(sequences):
+        scores = emission_scores(model.log_emission, sequences)
+        return hmm_filter(model.log_initial[:, None], model.log_transition[:, None], scores).log_likelihood
+
+    assert_close(evidence(symbols)[0, 0], evidence(every)[0].logsumexp(0))
+
+
+@pytest.mark.parametrize("topology", list(Topology))
+@pytest.mark.parametrize("prior", [1.0, 1.3])
+def test_one_round_of_baum_welch_matches_enumerated_counts(topology, prior):
+    states, num_symbols, time = 3, 4, 5
+    start = random_parameters(2, states, num_symbols, topology)
+    symbols, lengths = symbols_of(6, time, num_symbols, missing=0.2), torch.tensor([5, 3, 1, 4, 5, 2])
+    labels = torch.tensor([0, 1, 0, 1, 1, 0])
+    config = HMMConfig(
+        states, topology, emission_prior=prior, transition_prior=prior, iterations=1, tolerance=0.0
+    )
+    fitted = baum_welch(start, symbols, lengths, labels, config).parameters
+
+    for model in range(2):
+        starts, moves = torch.zeros(states).double(), torch.zeros(states, states).double()
+        emitted = torch.zeros(states, num_symbols).double()
+        for sequence, length, label in zip(symbols, lengths.tolist(), labels.tolist(), strict=True):
+            if label != model:
+                continue
+            scores = emission_scores(start.log_emission[model], sequence[None, :length])[0]
+            paths, joint = log_joint(start.log_initial[model], start.log_transition[model], scores)
+            for path, weight in zip(paths.tolist(), joint.softmax(0), strict=True):
+                starts[path[0]] += weight
+                for before, after in itertools.pairwise(path):
+                    moves[before, after] += weight
+                for state, symbol in zip(path, sequence[:length].tolist(), strict=True):
+                    if symbol != MISSING:
+                        emitted[state, symbol] += weight
+
+        def mode(counts, allowed, before):
+            weights = torch.where(allowed, counts + prior - 1, 0.0)
+            rows = weights.sum(-1, keepdim=True)
+            return torch.where(rows > 0, weights / rows, before)
+
+        for name, counts in (("log_initial", starts), ("log_transition", moves), ("log_emission", emitted)):
+            before = getattr(start, name)[model].exp()
+            assert_close(getattr(fitted, name)[model].exp(), mode(counts, before > 0, before))
+
+
+@pytest.mark.parametrize("topology", list(Topology))
+def test_baum_welch_matches_hmmlearn(topology):
+    states, num_symbols, iterations = 4, 6, 12
+    start = random_parameters(1, states, num_symbols, topology)
+    lengths = torch.tensor([17, 30, 8, 25])
+    symbols = symbols_of(4, 30, num_symbols)
+    config = HMMConfig(states, topology, **NO_SMOOTHING, iterations=iterations, tolerance=0.0)
+    fitted = baum_welch(start, symbols, lengths, torch.zeros_like(lengths), config)
+
+    oracle = CategoricalHMM(states, n_iter=iterations, tol=-float("inf"), init_params="", algorithm="viterbi")
+    oracle.startprob_ = start.log_initial[0].exp().numpy()
+    oracle.transmat_ = start.log_transition[0].exp().numpy()
+    oracle.emissionprob_ = start.log_emission[0].exp().numpy()
+    flat = torch.cat([row[:n] for row, n in zip(symbols, lengths.tolist(), strict=True)])[:, None].numpy()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # log 0 of the structural zeros
+        oracle.fit(flat, lengths.numpy())
+        score = oracle.score(flat, lengths.numpy())
+
+    tolerance = {"rtol": 0, "atol": 1e-8}
+    history = torch.tensor(list(oracle.monitor_.history), dtype=torch.float64)
+    assert_close(fitted.objective[:, 0], history, **tolerance)
+    assert_close(fitted.parameters.log_initial[0].exp(), torch.from_numpy(oracle.startprob_), **tolerance)
+    assert_close(fitted.parameters.log_transition[0].exp(), torch.from_numpy(oracle.transmat_), **tolerance)
+    assert_close(fitted.parameters.log_emission[0].exp(), torch.from_numpy(oracle.emissionprob_), **tolerance)
+    scores = emission_scores(fitted.parameters.log_emission, mask_padding(symbols, lengths))
+    evidence = hmm_filter(fitted.parameters.log_initial, fitted.parameters.log_transition, scores)
+    assert_close(evidence.log_likelihood.sum(), torch.tensor(score, dtype=torch.float64), **tolerance)
+
+
+def test_a_long_likelihood_matches_hmmlearn():
+    model = random_parameters(1, 4, 6)
+    symbols = symbols_of(1, 5000, 6)
+    scores = emission_scores(model.log_emission, symbols)
+    oracle = CategoricalHMM(4)
+    oracle.startprob_ = model.log_initial[0].exp().numpy()
+    oracle.transmat_ = model.log_transition[0].exp().numpy()
+    oracle.emissionprob_ = model.log_emission[0].exp().numpy()
+    expected = torch.tensor(oracle.score(symbols.T.numpy()), dtype=torch.float64)
+    found = hmm_filter(model.log_initial[:, None], model.log_transition[:, None], scores).log_likelihood
+    assert_close(found[0, 0], expected, rtol=1e-12, atol=0)
+    in_single = hmm_filter(
+        model.log_initial[0].float(), model.log_transition[0].float(), scores[0, 0].float()
+    ).log_likelihood
+    assert_close(in_single.double(), expected, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("topology", list(Topology))
+@pytest.mark.parametrize("prior", [1.0, 1.01, 2.0])
+def test_the_objective_never_falls_and_structural_zeros_stay(topology, prior):
+    symbols, lengths = symbols_of(24, 20, 7, missing=0.1), torch.randint(1, 21, (24,))
+    labels = torch.arange(24) % 3
+    config = HMMConfig(4, topology, prior, prior, iterations=40, tolerance=0.0)
+    start = equal_segments(symbols, lengths, labels, 3, 7, config, torch.Generator().manual_seed(1))
+    fitted = baum_welch(start, symbols, lengths, labels, config)
+    assert fitted.objective.isfinite().all()
+    assert (fitted.objective.diff(dim=0) >= -1e-9).all()
+    assert (fitted.objective[-1] > fitted.objective[0] + 1).all()  # and it does learn, 1 nat at least
+    for rows in (fitted.parameters.log_initial, fitted.parameters.log_transition):
+        assert_close(rows.exp().sum(-1), torch.ones_like(rows[..., 0]))
+    assert_close(fitted.parameters.log_emission.exp().sum(-1), torch.ones(3, 4, dtype=torch.float64))
+    if topology is Topology.left_to_right:
+        assert torch.isneginf(fitted.parameters.log_transition[:, 2, [0, 1]]).all()
+        assert torch.isneginf(fitted.parameters.log_initial[:, 1:]).all()
+
+
+def test_models_of_a_bank_are_fitted_as_if_alone():
+    symbols, lengths = symbols_of(30, 25, 8), torch.randint(2, 26, (30,))
+    labels = torch.arange(30) % 3
+    config = HMMConfig(iterations=100, tolerance=1e-3)  # models converge after different numbers of rounds
+    start = equal_segments(symbols, lengths, labels, 3, 8, config, torch.Generator().manual_seed(1))
+    together = baum_welch(start, symbols, lengths, labels, config)
+    assert len(set(together.iterations.tolist())) > 1
+    assert (together.status == Status.CONVERGED).all()
+    for model in range(3):
+        own = labels == model
+        longest = int(lengths[own].max())
+        alone = baum_welch(
+            Parameters(*(getattr(start, name)[model : model + 1] for name in vars(start))),
+            symbols[own, :longest],
+            lengths[own],
+            torch.zeros_like(lengths[own]),
+            config,
+        )
+        assert alone.iterations[0] == together.iterations[model]
+        for name in vars(start):
+            assert_close(getattr(alone.parameters, name)[0], getattr(together.parameters, name)[model])
+
+
+def test_scores_of_a_padded_batch_are_those_of_each_sequence():
+    hmm = DiscreteHMM(3, 6, HMMConfig(iterations=5))
+    symbols, lengths = symbols_of(12, 15, 6, missing=0.1), torch.randint(1, 16, (12,))
+    hmm.fit(symbols, lengths, torch.arange(12) % 3)
+    garbage = torch.where(torch.arange(15) < lengths[:, None], symbols, 10**6)  # padding is never looked at
+    scores = hmm.log_likelihood(garbage, lengths)
+    decoded = hmm.decode(garbage, lengths, torch.arange(12) % 3)
+    for s, length in enumerate(lengths.tolist()):
+        one = symbols[s : s + 1, :length], lengths[s : s + 1]
+        assert_close(scores[s], hmm.log_likelihood(*one)[0])
+        assert_close(decoded.states[s, :length], hmm.decode(*one, torch.tensor([s % 3])).states[0])
+
+
+def test_a_known_left_to_right_model_is_found():
+    """Four phases, each with a symbol of its own in nine frames of ten: training must find both."""
+    generator = torch.Generator().manual_seed(3)
+    phase = torch.arange(40) // 10
+    noisy = torch.rand(50, 40, generator=generator) < 0.1
+    symbols = torch.where(noisy, torch.randint(4, 8, (50, 40), generator=generator), phase)
+    hmm = DiscreteHMM(1, 8, HMMConfig())
+    fitted = hmm.fit(symbols, torch.full((50,), 40), torch.zeros(50, dtype=torch.long))
+    assert fitted.status.tolist() == [Status.CONVERGED]
+    share = hmm.log_emission[0].exp()
+    assert_close(share[range(4), range(4)], torch.full((4,), 0.9).double(), rtol=0, atol=0.03)
+    stay = hmm.log_transition[0].exp().diagonal()
+    assert_close(stay[:3], torch.full((3,), 0.9).double(), rtol=0, atol=0.01)
+    states = hmm.decode(symbols, torch.full((50,), 40), torch.zeros(50, dtype=torch.long)).states
+    assert (states == phase).float().mean() > 0.97  # a noisy frame at a border may fall to either side
+
+
+def test_an_unseen_symbol_is_finite_with_smoothing_and_never_silent_without():
+    symbols, lengths = torch.tensor([[0, 0, 1, 1]]), torch.tensor([4])
+    unseen = torch.tensor([[0, 2, 1, 1]])
+    smoothed = DiscreteHMM(1, 3, HMMConfig(2))
+    smoothed.fit(symbols, lengths, torch.tensor([0]))
+    assert smoothed.log_likelihood(unseen, lengths).isfinite().all()
+    assert smoothed.log_likelihood(unseen, lengths) < smoothed.log_likelihood(symbols, lengths)
+
+    hard = DiscreteHMM(1, 3, HMMConfig(2, **NO_SMOOTHING))
+    hard.fit(symbols, lengths, torch.tensor([0]))
+    assert hard.log_likelihood(symbols, lengths).isfinite().all()
+    with pytest.warns(RuntimeWarning, match=r"1 of 1 scores are minus infinity.*emission_prior above 1"):
+        assert torch.isneginf(hard.log_likelihood(unseen, lengths)).all()
+
+
+def test_an_impossible_training_sequence_spoils_its_own_model_only():
+    start = Parameters(
+        torch.zeros(2, 1).double(),
+        torch.zeros(2, 1, 1).double(),
+        torch.tensor([[[0.5, 0.5, 0.0]], [[0.5, 0.25, 0.25]]]).double().log(),
+    )
+    symbols = torch.tensor([[0, 1, 2], [0, 1, 2]])
+    config = HMMConfig(1, **NO_SMOOTHING)
+    fitted = baum_welch(start, symbols, torch.tensor([3, 3]), torch.tensor([0, 1]), config)
+    assert fitted.status.tolist() == [Status.IMPOSSIBLE, Status.CONVERGED]
+    assert_close(fitted.parameters.log_emission[1].exp(), torch.full((1, 3), 1 / 3).double())
+    assert "model 0: impossible" in fitted.summary()
+    smoothed = hmm_smoother(
+        start.log_initial[0], start.log_transition[0], start.log_emission[0, 0, symbols[0], None]
+    )
+    assert torch.isneginf(smoothed.log_likelihood)
+    assert (smoothed.states == 0).all()
+
+
+def test_models_without_data_or_time_say_so():
+    symbols = torch.tensor([[0, 1, 0, 1, 1, 0], [MISSING] * 6])
+    hmm = DiscreteHMM(3, 2, HMMConfig(2, iterations=1))
+    fitted = hmm.fit(symbols, torch.tensor([6, 6]), torch.tensor([0, 1]))
+    assert fitted.status.tolist() == [Status.MAX_ITERATIONS, Status.NO_DATA, Status.NO_DATA]
+    assert_close(hmm.log_likelihood(symbols, torch.tensor([6, 6]))[1], torch.zeros(3).double())
+
+
+@pytest.mark.parametrize("config", [HMMConfig(), HMMConfig(**NO_SMOOTHING)], ids=["smoothed", "not smoothed"])
+def test_sequences_shorter_than_the_states_train(config):
+    symbols, lengths = torch.tensor([[3, 1, 0], [2, 0, 0]]), torch.tensor([2, 1])
+    hmm = DiscreteHMM(1, 4, config)
+    fitted = hmm.fit(symbols, lengths, torch.tensor([0, 0]))
+    assert fitted.status.tolist() == [Status.CONVERGED]
+    assert hmm.log_likelihood(symbols, lengths).isfinite().all()
+
+
+def test_the_seed_decides_the_start():
+    symbols, lengths, labels = symbols_of(4, 9, 5), torch.full((4,), 9), torch.zeros(4, dtype=torch.long)
+
+    def start(seed):
+        generator = torch.Generator().manual_seed(seed)
+        return equal_segments(symbols, lengths, labels, 1, 5, HMMConfig(), generator).log_emission
+
+    assert torch.equal(start(1), start(1))
+    assert not torch.equal(start(1), start(2))
+
+
+def test_bad_input_is_named():
+    hmm = DiscreteHMM(2, 3)
+    symbols, lengths, labels = torch.tensor([[0, 1, 2]]), torch.tensor([3]), torch.tensor([0])
+    with pytest.raises(ValueError, match=r"symbols must lie in \[0, 3\).* got 0 to 3"):
+        hmm.log_likelihood(torch.tensor([[0, 3, 2]]), lengths)
+    with pytest.raises(ValueError, match=r"lengths must hold a number of frames in \[1, 3\].* got \[4\]"):
+        hmm.log_likelihood(symbols, torch.tensor([4]))
+    with pytest.raises(ValueError, match=r"lengths must .* got \[0\]"):
+        hmm.fit(symbols, torch.tensor([0]), labels)
+    with pytest.raises(ValueError, match=r"labels must name a model in \[0, 2\).* got \[2\]"):
+        hmm.fit(symbols, lengths, torch.tensor([2]))
+    with pytest.raises(ValueError, match="states must be at least 1, got 0"):
+        HMMConfig(states=0)
+    with pytest.raises(ValueError, match="emission_prior and transition_prior must be at least 1"):
+        HMMConfig(emission_prior=0.5)
+    with pytest.raises(ValueError, match="tolerance and start_noise must not be negative"):
+        HMMConfig(tolerance=-1.0)
+    with pytest.raises(ValueError, match="must have at least one frame"):
+        hmm_filter(torch.zeros(1), torch.zeros(1, 1), torch.zeros(0, 1))
