@@ -1,0 +1,254 @@
+"""Pictures for people: the pose drawn over an image, and the joint angles over time.
+
+Pixels (u, v) are column and row, an integer is a pixel's centre. Angles come in radians and are drawn in
+degrees. Left and right are the subject's.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from torch import Tensor, from_numpy
+
+from torchpose.atomic import replacing
+from torchpose.export import JOINT_NAMES, PoseSequence
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Colour = tuple[int, int, int]  # RGB, 0 to 255
+
+# One for each of the body's 14 segments, in their order: the left limbs warm and the right ones cool, which
+# the colour-blind tell apart, too, and paler towards the hands and feet.
+PART_COLOURS: tuple[Colour, ...] = (
+    (150, 150, 150),
+    (240, 228, 66),
+    *((190, 50, 0), (240, 120, 20), (255, 195, 130)),
+    *((0, 60, 150), (50, 130, 230), (160, 220, 255)),
+    *((130, 0, 120), (195, 70, 170), (235, 155, 215)),
+    *((0, 80, 40), (0, 165, 90), (150, 235, 160)),
+)
+_DARK: Colour = (60, 60, 60)
+UNLABELLED: Colour = (90, 90, 90)
+LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR = (213, 94, 0), (0, 114, 178), (255, 255, 255)
+STATUS_COLOURS: dict[str, Colour] = {
+    "absent": (190, 190, 190),
+    "entering": (86, 180, 233),
+    "tracked": (120, 220, 150),
+    "partial": (240, 228, 66),
+    "recovered": (240, 228, 66),
+    "lost": (255, 110, 90),
+}
+BONES: tuple[tuple[str, str], ...] = (
+    ("pelvis", "neck"),
+    ("neck", "head"),
+    *(
+        (f"{start}_{side}" if start not in ("neck", "pelvis") else start, f"{end}_{side}")
+        for side in ("left", "right")
+        for start, end in (
+            *(("neck", "shoulder"), ("shoulder", "elbow"), ("elbow", "wrist")),
+            *(("pelvis", "hip"), ("hip", "knee"), ("knee", "ankle")),
+        )
+    ),
+)
+# What a positive and a negative angle mean, by the name's last words (see `torchpose.body.angle`).
+_SIGNS = {
+    "trunk_rotation": "rotation, + to the right",
+    "lateral_bending": "lateral bending, + to the right",
+    "flexion": "flexion +, extension −",
+    "abduction": "abduction +, adduction −",
+    "rotation": "rotation, + inward",
+}
+_WORST_SD = np.pi / 4  # rad; an angle that is less certain says nothing, and its band would fill the panel
+_NO_POSE: dict[str, Any] = {"facecolor": "0.92", "edgecolor": "0.75", "hatch": "////", "linewidth": 0}
+_PANEL_COLUMNS = 3
+_LEAST_SPAN = 20.0  # degrees from the bottom to the top of a panel, so that noise looks like noise
+_SHIFT = 4  # bits behind the point in OpenCV's coordinates
+_FAR = 1e5  # px; beyond it OpenCV's coordinates would overflow
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """What to draw over one image; what is None, or has a NaN, is not drawn."""
+
+    status: str
+    outlines: Float[Tensor, "parts rim 2"] | None = None  # px, the spheroids' silhouettes as polygons
+    joints: Float[Tensor, "15 2"] | None = None  # px, in the order of `JOINT_NAMES`
+    points: Float[Tensor, "num 2"] | None = None  # px
+    labels: Int[Tensor, " num"] | None = None  # the part of each point; anything but 0 to 13 is none
+    text: tuple[str, ...] = ()  # lines below the status; plain ASCII
+
+
+def draw_overlay(image: Float[Tensor, "3 height width"], overlay: Overlay) -> Float[Tensor, "3 height width"]:
+    """The RGB image in [0, 1] with points, outlines, skeleton, status and text drawn over it, on the CPU."""
+    levels = image.detach().cpu().clamp(0, 1).mul(255).round().byte()
+    canvas = np.ascontiguousarray(levels.permute(1, 2, 0).numpy())
+    unit = max(1.0, canvas.shape[0] / 480)  # px; what is thin on a small image is not on a large one
+    if overlay.points is not None:
+        _draw_points(canvas, overlay, round(unit))
+    if overlay.outlines is not None:
+        _draw_outlines(canvas, overlay.outlines, round(unit))
+    if overlay.joints is not None:
+        _draw_skeleton(canvas, overlay.joints, unit)
+    _draw_text(canvas, overlay, unit)
+    return from_numpy(canvas).permute(2, 0, 1).to(image.dtype).div(255)
+
+
+def plot_angles(path: Path, sequence: PoseSequence) -> None:
+    """Draw the anatomical angles over time to a PNG: a panel for each, left and right in one.
+
+    The band is two standard deviations wide to each side; frames without a pose are shaded; an angle is left
+    out where its standard deviation is above 45 degrees.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    clean = sequence.without_stale_numbers()
+    panels = _panels(clean.angle_names)
+    rows = -(-len(panels) // _PANEL_COLUMNS)
+    figure = Figure(figsize=(11, 0.9 + 1.75 * rows), layout="constrained")
+    axes = figure.subplots(rows, _PANEL_COLUMNS, squeeze=False, sharex=True).ravel()
+    for panel, lines in zip(axes, panels.items(), strict=False):
+        _draw_panel(panel, clean, *lines)
+    for number, panel in enumerate(axes):
+        if number >= len(panels):
+            panel.set_visible(False)
+        elif number + _PANEL_COLUMNS >= len(panels):
+            panel.tick_params(labelbottom=True)
+            panel.set_xlabel("time (s)")
+        if number % _PANEL_COLUMNS == 0:
+            panel.set_ylabel("degrees")
+    figure.legend(
+        handles=[
+            Line2D([], [], color=_hex(LEFT_COLOUR), label="left"),
+            Line2D([], [], color=_hex(RIGHT_COLOUR), label="right"),
+            Line2D([], [], color=_hex(_DARK), label="trunk and neck"),
+            Patch(color="0.5", alpha=0.25, linewidth=0, label="two standard deviations to each side"),
+            Patch(**_NO_POSE, label="no pose"),
+        ],
+        loc="outside upper center",
+        ncols=5,
+        frameon=False,
+    )
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=110)
+
+
+def _panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:
+    """The columns of each panel's lines, by side: {"neck_flexion": {"": 3}, "hip_flexion": {"left": 5}}."""
+    panels: dict[str, dict[str, int]] = {}
+    for column, name in enumerate(names):
+        words = name.split("_")
+        side = next((word for word in words if word in ("left", "right")), "")
+        panels.setdefault("_".join(word for word in words if word != side), {})[side] = column
+    return panels
+
+
+def _panel_title(name: str) -> str:
+    for ending, meaning in _SIGNS.items():
+        if name.endswith(ending):
+            joint = name.removesuffix(ending).strip("_") or name.removesuffix("_rotation")
+            return f"{joint.capitalize()}: {meaning}"
+    return name.replace("_", " ").capitalize()
+
+
+def _draw_panel(axes: "Axes", sequence: PoseSequence, name: str, columns: dict[str, int]) -> None:
+    time = sequence.time_s.numpy()
+    colours = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR, "": _DARK}
+    low, high = np.inf, -np.inf
+    for side, column in columns.items():
+        angle, sd = (np.rad2deg(values[:, column].numpy()) for values in (sequence.angles, sequence.angle_sd))
+        angle = np.where(sd > np.rad2deg(_WORST_SD), np.nan, angle)  # an unknown sd is not a large one
+        colour = _hex(colours[side])
+        axes.fill_between(time, angle - 2 * sd, angle + 2 * sd, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(time, angle, color=colour, linewidth=1.2, marker=".", markersize=1.5)
+        known = np.isfinite(angle)
+        margin = np.median(2 * sd[known & np.isfinite(sd)]) if (known & np.isfinite(sd)).any() else 0.0
+        low = min(low, angle[known].min(initial=np.inf) - margin)
+        high = max(high, angle[known].max(initial=-np.inf) + margin)
+    if low > high:
+        low = high = 0.0
+    half = max(_LEAST_SPAN, 1.1 * (high - low)) / 2
+    axes.set_ylim((low + high) / 2 - half, (low + high) / 2 + half)
+    for start, stop in _gaps(sequence):
+        axes.axvspan(start, stop, **_NO_POSE, zorder=0)
+    axes.axhline(0, color="0.7", linewidth=0.6, zorder=0.5)
+    axes.set_title(_panel_title(name), fontsize=9, loc="left")
+    axes.tick_params(labelsize=8)
+    axes.margins(x=0)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _gaps(sequence: PoseSequence) -> Iterator[tuple[float, float]]:
+    """Start and end (s) of each run of frames without a pose, half a frame beyond its first and last."""
+    time = sequence.time_s.numpy()
+    half = np.diff(time).min(initial=np.inf) / 2 if len(time) > 1 else 0.5
+    lost = np.concatenate([[False], ~np.asarray(sequence.answered, dtype=bool), [False]])
+    edges = np.flatnonzero(lost[1:] != lost[:-1])
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        yield float(time[first] - half), float(time[end - 1] + half)
+
+
+def _draw_points(canvas: np.ndarray, overlay: Overlay, radius: int) -> None:
+    assert overlay.points is not None
+    pixels = overlay.points.detach().cpu().double().numpy()
+    known = np.isfinite(pixels).all(axis=1)
+    centres = np.rint(np.where(known[:, None], pixels, -_FAR)).clip(-_FAR, _FAR).astype(np.int64)
+    palette = np.array([*PART_COLOURS, UNLABELLED], dtype=np.uint8)
+    labels = np.full(len(pixels), -1) if overlay.labels is None else overlay.labels.detach().cpu().numpy()
+    labels = np.where((labels >= 0) & (labels < len(PART_COLOURS)), labels, len(PART_COLOURS))
+    steps = np.arange(-radius, radius + 1)
+    du, dv = (offset.ravel() for offset in np.meshgrid(steps, steps))
+    disc = du**2 + dv**2 <= radius**2 + 1
+    u, v = centres[:, :1] + du[disc], centres[:, 1:] + dv[disc]
+    seen = (u >= 0) & (u < canvas.shape[1]) & (v >= 0) & (v < canvas.shape[0])
+    canvas[v[seen], u[seen]] = np.broadcast_to(palette[labels][:, None], (*u.shape, 3))[seen]
+
+
+def _draw_outlines(canvas: np.ndarray, outlines: Float[Tensor, "parts rim 2"], thickness: int) -> None:
+    for part, polygon in enumerate(outlines.detach().cpu().double().numpy()):
+        if np.isfinite(polygon).all():
+            colour = PART_COLOURS[part % len(PART_COLOURS)]
+            cv2.polylines(canvas, [_fixed_point(polygon)], True, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_skeleton(canvas: np.ndarray, joints: Float[Tensor, "15 2"], unit: float) -> None:
+    pixels = dict(zip(JOINT_NAMES, joints.detach().cpu().double().numpy(), strict=True))
+    # A dark rim below all bones, then the bones: they stand out on any background.
+    for rim in (True, False):
+        for start, end in BONES:
+            if not np.isfinite([pixels[start], pixels[end]]).all():
+                continue
+            left, right = end.endswith("_left"), end.endswith("_right")
+            colour = LEFT_COLOUR if left else RIGHT_COLOUR if right else MIDDLE_COLOUR
+            a, b = _fixed_point(np.stack([pixels[start], pixels[end]])).tolist()
+            width = round((4 if rim else 2) * unit)
+            cv2.line(canvas, a, b, (0, 0, 0) if rim else colour, width, cv2.LINE_AA, _SHIFT)
+    for pixel in pixels.values():
+        if np.isfinite(pixel).all():
+            radius = round(2.5 * unit * 2**_SHIFT)
+            centre = _fixed_point(pixel).tolist()
+            cv2.circle(canvas, centre, radius, (255, 255, 255), cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_text(canvas: np.ndarray, overlay: Overlay, unit: float) -> None:
+    size, step = 0.42 * unit, 16 * unit
+    for row, line in enumerate((overlay.status, *overlay.text)):
+        colour = STATUS_COLOURS.get(line, (255, 255, 255)) if row == 0 else (255, 255, 255)
+        origin = (round(8 * unit), round(step * (row + 1.1)))
+        for shade, width in (((0, 0, 0), round(3 * unit)), (colour, round(unit))):
+            cv2.putText(canvas, line, origin, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
+
+
+def _fixed_point(pixels: np.ndarray) -> np.ndarray:
+    """Pixels in OpenCV's coordinates with `_SHIFT` bits behind the point."""
+    return np.rint(pixels.clip(-_FAR, _FAR) * 2**_SHIFT).astype(np.int32)
+
+
+def _hex(colour: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
