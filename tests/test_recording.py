@@ -15,6 +15,7 @@ from torchpose.calibration import read_calibration
 from torchpose.recording import (
     Backgrounds,
     Frame,
+    Recording,
     UnreadableFrame,
     open_recording,
     write_recording,
@@ -87,6 +88,7 @@ def test_stereo_frames_are_rgb_in_order_of_their_numbers(stereo: Path):
     save(stereo / "left" / "000004.png", pixels)
     (stereo / "left" / "Thumbs.db").write_text("not an image")
     recording = open_recording(stereo)
+    assert isinstance(recording, Recording)
     assert len(recording) == 3
     assert recording.indices == (3, 4, 10)
     assert [frame.index for frame in recording] == [3, 4, 10]

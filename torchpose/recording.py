@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -56,6 +56,7 @@ class UnreadableFrame(ValueError):
         self.time_s = time_s
 
 
+@runtime_checkable
 class Recording(Protocol):
     """Anything that has frames by one camera, whether on disk or made up."""
 
