@@ -22,18 +22,21 @@ _FIELDS = ("joints", "offsets", "label", "subject", "take", "joint_names")
 
 @dataclass(frozen=True)
 class Clip:
-    """What was seen of one performance, T frames; every stream that is there has the same T."""
+    """What was seen of one performance: streams of T frames each, of which any may be absent.
+
+    T has another name in each annotation, so that unequal lengths reach the check with the better message.
+    """
 
     activity: str
     subject: str
     take: str
     # Body pose: translation m, root angles (yaw, pitch, roll) and joint parameters rad; NaN in a lost frame.
-    pose: Float[Tensor, "time 24"] | None = None
+    pose: Float[Tensor, "poses 24"] | None = None
     # Unit vectors of the limbs in the torso's frame (x left, y down, z backward).
-    directions: Float[Tensor, "time limbs 3"] | None = None
+    directions: Float[Tensor, "frames limbs 3"] | None = None
     # Foreground, or the share of each pixel that is.
-    silhouettes: Float[Tensor, "time height width"] | Bool[Tensor, "time height width"] | None = None
-    joints: Float[Tensor, "time joints 3"] | None = None  # m, any frame; needs `joint_names`
+    silhouettes: Float[Tensor, "images height width"] | Bool[Tensor, "images height width"] | None = None
+    joints: Float[Tensor, "skeletons joints 3"] | None = None  # m, any frame; needs `joint_names`
     joint_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -131,7 +134,7 @@ def read_skeletons(path: Path | str, dtype: torch.dtype = torch.float32) -> list
     if not path.is_file():
         raise FileNotFoundError(f"no skeleton data set at {path}; give an .npz as data.path")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in _FIELDS if name in archive}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} must be an .npz of plain arrays, but it cannot be read: {error}") from error
