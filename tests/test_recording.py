@@ -106,6 +106,14 @@ def test_stereo_frames_are_rgb_in_order_of_their_numbers(stereo: Path):
         recording[3]
 
 
+def test_frames_come_in_the_order_of_their_numbers_however_these_are_written(tmp_path: Path):
+    calibrate(tmp_path, STEREO)
+    for side in ("left", "right"):
+        for name in ("9.png", "10.png", "0007.JPG"):
+            save(tmp_path / side / name, colour_pixels())
+    assert [frame.index for frame in open_recording(tmp_path)] == [7, 9, 10]
+
+
 def test_frames_are_read_when_they_are_asked_for(stereo: Path):
     recording = open_recording(str(stereo))
     pixels = colour_pixels()
