@@ -3,12 +3,13 @@
 import inspect
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import torch
 
+from torchpose.pipeline import EyesConfig, PoseConfig
 from torchpose.settings import compose_config, config_groups, describe
 
 PACKAGE = Path(__file__).resolve().parent
@@ -32,6 +33,8 @@ class InferConfig:
     seed: int = 0  # the same seed gives the same results
     device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
     threads: int = 1  # of the processor; more help only where cores are idle
+    eyes: EyesConfig = field(default_factory=EyesConfig)
+    pose: PoseConfig = field(default_factory=PoseConfig)
 
     def __post_init__(self) -> None:
         if self.max_frames is not None and self.max_frames < 1:

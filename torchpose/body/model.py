@@ -156,6 +156,15 @@ class BodyModel(nn.Module):
     def default_size(self, batch: int) -> Float[Tensor, "batch sizes"]:
         return torch.ones(batch, len(self.size_names), dtype=self.axes.dtype, device=self.axes.device)
 
+    @property
+    def height(self) -> float:
+        """Height of the person whose sizes are all 1, m."""
+        return self.skeleton.height
+
+    def size_of_height(self, height: float) -> Float[Tensor, "1 sizes"]:
+        """Sizes of a person of `height` m with the body file's proportions."""
+        return self.default_size(1) * (height / self.height)
+
     def forward(
         self, pose: Float[Tensor, "batch parameters"], size: Float[Tensor, "#batch sizes"] | None = None
     ) -> PosedBody:

@@ -82,6 +82,7 @@ class Joint:
 class Skeleton:
     """A body file, expanded to both sides and checked. Bodies stand before their children."""
 
+    height: float  # m, of the person whose sizes are all 1
     sizes: tuple[str, ...]
     num_lengths: int  # the first of `sizes` are lengths, the others girths
     root: str
@@ -208,7 +209,10 @@ def _expand(data: dict[str, Any]) -> Skeleton:
             side, at = body.removeprefix(entry["body"]), sized(entry["at"])
             joints.append(Joint(name + side, names.index(body), at.mirrored() if side == "_right" else at))
     segments.sort(key=lambda segment: segment.body)  # stable: along the tree, in the file's order on a body
-    return Skeleton(sizes, len(data["lengths"]), roots[0], tuple(bodies), tuple(segments), tuple(joints))
+    height = float(data["height"])
+    if not height > 0:
+        raise ValueError(f"height must be positive, in metres, got {height}")
+    return Skeleton(height, sizes, len(data["lengths"]), roots[0], tuple(bodies), tuple(segments), tuple(joints))
 
 
 def _vector(value: Any) -> Vector:

@@ -18,7 +18,7 @@ from torchpose.vision.camera import StereoCamera
 
 
 @dataclass(frozen=True)
-class SilhouetteConfig:
+class RimConfig:
     weight: float = 1.0  # of the whole term against the points; 0 switches it off
     sd: float = 0.02  # m, by which a rim may stand out of the mask
     rim_points: int = 12  # per part
@@ -51,7 +51,7 @@ def nearest_inside(mask: Bool[Tensor, "batch height width"]) -> Float[Tensor, "b
 
 
 def silhouette_rows(
-    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: SilhouetteConfig
+    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: RimConfig
 ) -> Rows:
     """A row for each rim point of each part: where it projects beside the mask, it is drawn to the mask's edge.
 
@@ -82,7 +82,7 @@ def silhouette_rows(
 
 
 def overhang(
-    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: SilhouetteConfig
+    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: RimConfig
 ) -> Float[Tensor, " batch"]:
     """How far the body's rims stand out of the mask, m: the mean over the rim points, each at most `reach`."""
     rows = silhouette_rows(posed, nearest, camera, config)

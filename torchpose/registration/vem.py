@@ -16,7 +16,7 @@ from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import Status
 from torchpose.registration.fitting import FittingConfig, PosePrior, Rows, fit_pose, linearize_by_screws
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
-from torchpose.registration.silhouette import SilhouetteConfig, overhang, silhouette_rows
+from torchpose.registration.silhouette import RimConfig, overhang, silhouette_rows
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
 
@@ -45,7 +45,7 @@ class RegistrationConfig:
     rest_support: float = 5.0  # points on a limb that halve this pull
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
-    silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    rim: RimConfig = field(default_factory=RimConfig)
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -166,8 +166,8 @@ class Registrar(nn.Module):
             belief = torch.zeros_like(labelling.belief).scatter(1, best, 1.0)[:, : self.body.num_parts]
             belief = belief * observation.cloud.mask[:, None]
         rows = self._point_rows(posed, foot, belief, observation.cloud)
-        if self.config.silhouette.weight > 0:
-            across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.silhouette)
+        if self.config.rim.weight > 0:
+            across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.rim)
             # Rims of one part move together, so they count as a few independent measurements, not as many.
             rows = Rows.cat(rows, across)
         return rows, belief.sum(2)
@@ -236,8 +236,8 @@ class Registrar(nn.Module):
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.distance.amin(1) * cloud.mask
         misfit = nearest.clamp_max(0.2).sum(1) / count
-        if config.silhouette.weight > 0:
-            misfit = misfit + overhang(posed, observation.nearest, observation.camera, config.silhouette)
+        if config.rim.weight > 0:
+            misfit = misfit + overhang(posed, observation.nearest, observation.camera, config.rim)
         return Registration(
             pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, bound, status
         )

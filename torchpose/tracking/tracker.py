@@ -74,6 +74,10 @@ class Tracker(nn.Module):
         self._velocity: Tensor | None = None  # per second
         self._time = 0.0
 
+    def begin(self, pose: Float[Tensor, "1 parameters"], time_s: float) -> None:
+        """Take a known pose as the last one: the next frame follows it instead of searching."""
+        self._pose, self._velocity, self._time = pose, None, time_s
+
     def forward(
         self,
         time_s: float,

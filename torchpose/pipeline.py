@@ -1,0 +1,339 @@
+"""The stages as one module: frames of a recording in, poses of a person out.
+
+`Eyes` turns a frame into points and evidence, `StereoToPose` turns a recording's frames into poses. Left-camera frame,
+metres and radians.
+"""
+
+import math
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, angle_sd, limb_angles
+from torchpose.body.model import BodyConfig, BodyModel
+from torchpose.export import PoseSequence
+from torchpose.recording import Backgrounds, Frame, Recording, UnreadableFrame
+from torchpose.registration.likelihood import (
+    AppearanceConfig,
+    Evidence,
+    FaceLikelihood,
+    PartLikelihood,
+    TorsoLikelihood,
+    appearance_potential,
+)
+from torchpose.registration.silhouette import nearest_inside
+from torchpose.registration.start import StartConfig, Starter
+from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
+from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
+from torchpose.vision.background import (
+    BackgroundConfig,
+    BackgroundModel,
+    DepthBackground,
+    DepthBackgroundConfig,
+    SilhouetteConfig,
+    person_silhouette,
+    search_region,
+)
+from torchpose.vision.camera import StereoCamera
+from torchpose.vision.faces import FaceConfig, FaceDetector, Faces
+from torchpose.vision.points import PointCloud, SamplingConfig, sample_grid
+from torchpose.vision.stereo import GrowingSeeds, GrowingSeedsConfig
+
+
+@dataclass(frozen=True)
+class EyesConfig:
+    """From images to points."""
+
+    nearest: float = 1.2  # m, of the person: with `farthest` it bounds the disparities that are searched
+    farthest: float = 8.0  # m
+    background_frames: int = 15  # of the recording, from which the empty scene is learned if none is given
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
+    silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    stereo: GrowingSeedsConfig = field(default_factory=GrowingSeedsConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    face: FaceConfig = field(default_factory=FaceConfig)
+    min_points: int = 60  # fewer points on the person are nobody
+
+    def __post_init__(self) -> None:
+        if not 0 < self.nearest < self.farthest:
+            raise ValueError(f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}")
+        if self.background_frames < 1 or self.min_points < 1:
+            raise ValueError("background_frames and min_points must be at least 1")
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """From points to poses."""
+
+    body: BodyConfig = field(default_factory=BodyConfig)
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    start: StartConfig = field(default_factory=StartConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    height: float = 0.0  # m, of the person; 0 measures it
+    height_frames: int = 8  # of the recording, from which it is measured
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the eyes make of one frame, batch 1."""
+
+    images: Float[Tensor, "1 3 height width"]  # the left or the colour image; grey depth where there is none
+    depth: Float[Tensor, "1 height width"]  # m, NaN where unknown
+    silhouette: Bool[Tensor, "1 height width"]
+    cloud: PointCloud
+    faces: Faces
+    present: bool  # somebody is there
+    cut: bool  # the silhouette meets the image's border
+
+
+class Stopwatch:
+    """Processor time by stage, s."""
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def measure(self, stage: str) -> Iterator[None]:
+        begin = time.process_time()
+        yield
+        self.seconds[stage] += time.process_time() - begin
+
+
+class Eyes(nn.Module):
+    """Silhouette, depth, points and face of each frame of one recording."""
+
+    def __init__(self, camera: StereoCamera, config: EyesConfig = EyesConfig()):
+        super().__init__()
+        self.camera = camera
+        self.config = config
+        self.stereo = GrowingSeeds(config.stereo)
+        self.find_faces = FaceDetector(config.face)
+        self.stopwatch = Stopwatch()
+        self.background: BackgroundModel | DepthBackground | None = None
+        self.background_depth: Tensor | None = None
+
+    @property
+    def disparity_range(self) -> tuple[int, int]:
+        """Disparities that `nearest` to `farthest` allow, px."""
+        near, far = self.camera.disparity(torch.tensor([self.config.nearest, self.config.farthest])).tolist()
+        return math.floor(far), math.ceil(near)
+
+    def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
+        """Learn the empty scene from its frames, or where there are none from the recording itself."""
+        spread = _spread(len(recording), self.config.background_frames)
+        if self.camera.baseline is None:
+            depth = backgrounds.depth
+            if depth is None:
+                depth = _stack([frame.depth for frame in _readable(recording, spread)])
+                # Whoever walks through stands before the scene, so of all readings the far ones are the scene's.
+                depth = torch.nanquantile(depth, 0.9, dim=0)[None]
+            self.background = DepthBackground(depth.to(device), self.config.depth_background)
+            self.background_depth = self.background.depth
+            return
+        if backgrounds.left is not None and backgrounds.right is not None:
+            left, right = backgrounds.left.to(device), backgrounds.right.to(device)
+            self.background = BackgroundModel(left, self.config.background)
+        else:
+            frames = list(_readable(recording, spread))
+            left, right = (_stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right"))
+            self.background = BackgroundModel.from_recording(left, self.config.background)
+            left, right = left.median(0, keepdim=True).values, right.median(0, keepdim=True).values
+        with self.stopwatch.measure("background"):
+            disparity = self.stereo(left[:1], right[:1], disparity_range=(0, self.disparity_range[1]))
+            self.background_depth = self.camera.depth(disparity.values)[0]
+
+    def forward(self, frame: Frame, device: torch.device) -> Sight:
+        """Look at one frame."""
+        if self.background is None:
+            raise ValueError("the background must be learned before a frame is looked at; call learn_background")
+        if frame.depth is not None:
+            depth = frame.depth[None].to(device)
+            images = frame.left[None].to(device) if frame.left is not None else _grey(depth)
+            with self.stopwatch.measure("background"):
+                log_odds = self.background(depth)
+        else:
+            assert frame.left is not None and frame.right is not None
+            images, right = frame.left[None].to(device), frame.right[None].to(device)
+            with self.stopwatch.measure("background"):
+                log_odds = self.background(images)
+                region = search_region(log_odds, self.config.silhouette)
+            with self.stopwatch.measure("stereo"):
+                disparity = self.stereo(images, right, region, disparity_range=self.disparity_range)
+                depth = self.camera.depth(disparity.values)
+        with self.stopwatch.measure("silhouette"):
+            silhouette = person_silhouette(
+                log_odds, depth, self.config.silhouette, self.background_depth, self.camera
+            ).mask
+        with self.stopwatch.measure("points"):
+            cloud = sample_grid(depth, silhouette, self.camera, self.config.sampling)
+        with self.stopwatch.measure("faces"):
+            faces = self.find_faces(images, silhouette, depth, self.camera)
+        present = int(cloud.mask.sum()) >= self.config.min_points
+        return Sight(images, depth, silhouette, cloud, faces, present, _touches_border(silhouette[0]))
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """One frame's result: what was seen and what was fitted. `sight` is None where the frame could not be read."""
+
+    index: int
+    time_s: float
+    status: TrackStatus
+    registration: Registration | None
+    sight: Sight | None
+    problem: str = ""  # what was wrong with the frame
+
+
+class StereoToPose(nn.Module):
+    """A recording's frames to poses: eyes, body, registration and tracking as one module.
+
+    `likelihoods` are the appearance terms; a learned one is added to this list.
+    """
+
+    def __init__(self, camera: StereoCamera, eyes: EyesConfig = EyesConfig(), config: PoseConfig = PoseConfig()):
+        super().__init__()
+        self.camera = camera
+        self.config = config
+        self.eyes = Eyes(camera, eyes)
+        self.body = BodyModel(config.body)
+        names = self.body.segment_names
+        self.likelihoods: list[PartLikelihood] | nn.ModuleList = nn.ModuleList(
+            [FaceLikelihood(names, config.appearance), TorsoLikelihood(names, config.appearance)]
+        )
+        registrar = Registrar(self.body, config.registration)
+        starter = Starter(self.body, config.start, config.registration)
+        self.tracker = Tracker(self.body, config.tracking, registrar, starter)
+        self.register_buffer("size", self.body.default_size(1), persistent=False)
+        self.stopwatch = self.eyes.stopwatch
+
+    @property
+    def device(self) -> torch.device:
+        """Where the computing happens."""
+        return self.body.axes.device
+
+    def observe(self, sight: Sight) -> Observation:
+        """A sight as registration takes it."""
+        evidence = Evidence(sight.images, sight.silhouette, sight.cloud, sight.faces)
+        potential = appearance_potential(list(self.likelihoods), evidence, self.body.num_parts)
+        return Observation(sight.cloud, potential, nearest_inside(sight.silhouette), self.camera)
+
+    def prepare(self, recording: Recording) -> None:
+        """Learn the recording's background and the person's height."""
+        self.eyes.learn_background(recording.background(), recording, self.device)
+        self.tracker.forget()
+        height = self.config.height
+        if height == 0:
+            frames = _readable(recording, _spread(len(recording), self.config.height_frames))
+            height = self.measure_height([self.eyes(frame, self.device) for frame in frames])
+        self.size = self.body.size_of_height(height)
+
+    def measure_height(self, sights: list[Sight]) -> float:
+        """The person's height, m: from the head's top to the lowest point, the greatest of the frames.
+
+        Whoever stoops looks shorter, never taller, so of the frames with a whole person the second tallest counts
+        (the tallest may hold a stray point). Without a whole person it is the body file's height.
+        """
+        heights = sorted(_upright_extent(sight) for sight in sights if sight.present and not sight.cut)
+        default = self.body.height
+        if not heights:
+            return default
+        # The cloud's rim lies half a grid step inside the silhouette, at the head and at the feet.
+        measured = heights[-2] if len(heights) > 2 else heights[-1]
+        return min(max(measured + 0.03, 0.8 * default), 1.2 * default)
+
+    def forward(self, recording: Recording) -> Iterator[FramePose]:
+        """Poses of a prepared recording's frames, in order. A frame that cannot be read is lost, and said so."""
+        for position in range(len(recording)):
+            try:
+                frame = recording[position]
+            except UnreadableFrame as error:
+                yield FramePose(error.index, error.time_s, TrackStatus.lost, None, None, str(error))
+                continue
+            yield self.follow(frame)
+
+    def follow(self, frame: Frame) -> FramePose:
+        """The next frame's pose."""
+        sight = self.eyes(frame, self.device)
+        with self.stopwatch.measure("registration"):
+            observation = self.observe(sight) if sight.present else None
+            tracked = self.tracker(frame.time_s, observation, sight.faces, self.size, sight.cut)
+        return FramePose(frame.index, frame.time_s, tracked.status, tracked.registration, sight)
+
+    def sequence(self, frames: list[FramePose]) -> PoseSequence:
+        """The frames' numbers, as they are written: NaN wherever there is no pose."""
+        T, body = len(frames), self.body
+        found = [i for i, frame in enumerate(frames) if frame.registration is not None]
+        fits = [frame.registration for frame in frames if frame.registration is not None]
+
+        def spread(rows: Tensor) -> Tensor:
+            full = rows.new_full((T, *rows.shape[1:]), torch.nan)
+            full[found] = rows
+            return full
+
+        P = body.num_parameters
+        pose = torch.cat([fit.pose for fit in fits]) if fits else self.size.new_zeros(0, P)
+        covariance = torch.cat([fit.covariance for fit in fits]) if fits else self.size.new_zeros(0, P, P)
+        distance = torch.cat([fit.point_to_model for fit in fits]) if fits else self.size.new_zeros(0)
+        posed = body(pose, self.size)
+        return PoseSequence(
+            frame=torch.tensor([frame.index for frame in frames]),
+            time_s=torch.tensor([frame.time_s for frame in frames], dtype=torch.float64),
+            status=tuple(frame.status.value for frame in frames),
+            point_to_model=spread(distance),
+            joints=spread(posed.joints),
+            angle_names=ANATOMICAL_NAMES,
+            angles=spread(anatomical_angles(body, posed)),
+            angle_sd=spread(angle_sd(body, pose, covariance, self.size)),
+            limb_angle_names=LIMB_ANGLE_NAMES,
+            limb_angles=spread(limb_angles(posed.joints)),
+            pose=spread(pose),
+            pose_covariance=spread(covariance),
+        )
+
+
+def _upright_extent(sight: Sight) -> float:
+    """From the head's top down to the lowest point, m."""
+    points = sight.cloud.points[0][sight.cloud.mask[0]]
+    middle = points.median(0).values
+    center = sight.faces.position[0, 0] if bool(sight.faces.found[0]) else middle[0]
+    column = points[(points[:, 0] - center).abs() < 0.12, 1]  # raised hands are beside the head
+    return float(torch.quantile(points[:, 1], 0.99) - torch.quantile(column, 0.01))
+
+
+def _touches_border(mask: Bool[Tensor, "height width"]) -> bool:
+    """Whether a few pixels of a mask lie on the image's edge; the sides of stereo's blind strip count as inside."""
+    edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    return int(edge.sum()) > 4
+
+
+def _spread(length: int, count: int) -> list[int]:
+    return sorted({round(i * (length - 1) / max(count - 1, 1)) for i in range(min(count, length))})
+
+
+def _readable(recording: Recording, positions: list[int]) -> Iterator[Frame]:
+    for position in positions:
+        try:
+            yield recording[position]
+        except UnreadableFrame:
+            continue
+
+
+def _stack(values: list[Tensor | None]) -> Tensor:
+    there = [value for value in values if value is not None]
+    if not there:
+        raise ValueError("the scene must be seen in at least one readable frame, got none; check the recording")
+    return torch.stack(there)
+
+
+def _grey(depth: Float[Tensor, "batch height width"]) -> Float[Tensor, "batch 3 height width"]:
+    """A picture of a depth image for people: near is bright."""
+    near = (1 / depth.clamp_min(0.5)).nan_to_num(0.0).clamp(0, 2) / 2
+    return near[:, None].expand(-1, 3, -1, -1)
