@@ -1,4 +1,4 @@
-"""Tapered super-quadrics: the surface, its normals, and where rays enter the solid."""
+"""Tapered super-quadrics: the surface, its normals, where rays enter the solid, and a person."""
 
 import math
 
@@ -6,8 +6,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpose.body.superquadric import Superquadric, bounding_box, implicit, intersect, normals, surface
+from torchpose.body.model import BodyModel
+from torchpose.body.superquadric import (
+    DisplayModel,
+    Person,
+    Superquadric,
+    bounding_box,
+    draw_person,
+    implicit,
+    intersect,
+    normals,
+    surface,
+)
 
+BODY = BodyModel()
 SHAPES = [
     pytest.param(0.0, 2, id="ellipsoid"),
     pytest.param(-0.45, 2, id="tapered round"),
@@ -169,3 +181,97 @@ def test_senseless_shapes_are_refused(size, taper, exponent, message):
 def test_a_surface_needs_enough_points():
     with pytest.raises(ValueError, match="around >= 3"):
         surface(one(0.0, 2), around=2)
+
+
+def upright(arms: Tensor | None = None) -> Tensor:
+    """A pose at the origin with hanging limbs, or other arm directions (left and right, upper arm and
+    forearm).
+    """
+    limbs = torch.tensor([0.0, 1.0, 0.0]).repeat(1, 9, 1)
+    limbs[0, 0, 1] = -1
+    if arms is not None:
+        limbs[0, 1:5] = arms
+    zero = torch.zeros(1, 3)
+    return BODY.pose_from_directions(zero, zero, limbs)
+
+
+def drawn(person: Person, pose: Tensor) -> tuple[Tensor, DisplayModel]:
+    """Surface points (shapes, points, 3) of a person in a pose, in the camera's frame."""
+    display = DisplayModel(BODY, person)
+    parts = display(BODY(pose, person.size(BODY)))
+    points = surface(display.shapes, 24, 13)[0].flatten(1, 2)
+    return points @ parts.rotations[0].mT + parts.origins[0][:, None], display
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_person_is_as_tall_as_stated(seed):
+    person = draw_person(seed)
+    height = drawn(person, upright())[0][..., 1]
+    assert (height.max() - height.min()).item() == pytest.approx(person.height, abs=0.02)
+
+
+def test_each_part_lies_about_the_segment_it_is_labelled_with():
+    points, display = drawn(Person(), upright())
+    posed = BODY(upright(), Person().size(BODY))
+    assert set(display.segments.tolist()) == set(range(14))
+    for segment in range(14):
+        center = points[display.segments == segment].mean((0, 1))
+        assert (posed.centers[0] - center).norm(dim=-1).argmin() == segment
+
+
+def test_the_right_side_is_the_mirror_image_of_the_left():
+    one, other = torch.tensor([0.8, 0.0, -0.6]), torch.tensor([0.0, -0.6, -0.8])
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    points, display = drawn(Person(), upright(torch.stack((one, other, one * flip, other * flip))))
+    pairs = [
+        (BODY.segment_names.index(f"{name}_left"), BODY.segment_names.index(f"{name}_right"))
+        for name in ("upper_arm", "forearm", "hand", "thigh", "shank", "foot")
+    ]
+    for left, right in pairs:
+        first, second = (points[display.segments == side].flatten(0, 1) for side in (left, right))
+        nearest = torch.cdist(first * flip, second).amin(-1)
+        assert nearest.max() < 0.012  # as sets of surface points, whose spacing is about a centimetre
+
+
+def test_clothes_reach_as_far_as_the_person_says():
+    segment = {
+        name: BODY.segment_names.index(name) for name in ("upper_arm_left", "forearm_left", "shank_right")
+    }
+
+    def cuts(person: Person, name: str) -> set[float]:
+        display = DisplayModel(BODY, person)
+        return {round(cut, 3) for cut in display.cuts[display.segments == segment[name]].tolist()}
+
+    short = Person(sleeve=0.4, trouser=0.75)
+    assert cuts(short, "upper_arm_left") == {0.8, 1.0}  # 1.0: the shoulder
+    assert cuts(short, "forearm_left") == {0.0}
+    assert cuts(short, "shank_right") == {0.5}
+    assert cuts(Person(sleeve=1.0), "forearm_left") == {1.0}
+
+
+def test_people_are_drawn_by_seed():
+    assert draw_person(5) == draw_person(5)
+    people = [draw_person(seed) for seed in range(30)]
+    assert len({person.pattern for person in people}) == 30
+    heights = torch.tensor([person.height for person in people])
+    assert heights.min() > 1.54
+    assert heights.max() < 1.93
+    assert heights.std() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"height": 175.0}, r"height must lie in \[1.0, 2.3\], got 175"),
+        ({"sleeve": 1.5}, "sleeve must lie in"),
+        ({"colours": ((0.5, 0.5, 0.5),)}, "colours must be 5 RGB triples"),
+    ],
+)
+def test_senseless_people_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        Person(**wrong)
+
+
+def test_a_person_of_another_body_file_is_refused():
+    with pytest.raises(ValueError, match="the person has 2 lengths and the body 8"):
+        DisplayModel(BODY, Person(lengths=(1.0, 1.0)))

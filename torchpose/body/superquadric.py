@@ -305,8 +305,8 @@ def draw_person(seed: int) -> Person:
         girth=uniform(0.9, 1.15),
         lengths=tuple(uniform(0.96, 1.04) for _ in range(8)),
         colours=colours,
-        sleeve=uniform(0.3, 0.45) if uniform(0, 1) < 0.6 else 1.0,
-        trouser=1.0 if uniform(0, 1) < 0.75 else uniform(0.35, 0.5),
+        sleeve=uniform(0.3, 0.45) if uniform(0.0, 1.0) < 0.6 else 1.0,
+        trouser=1.0 if uniform(0.0, 1.0) < 0.75 else uniform(0.35, 0.5),
         pattern=int(torch.randint(2**31, (), generator=generator)),
     )
 
@@ -345,8 +345,9 @@ def load_parts() -> list[Part]:
     sided = {"upper_arm", "forearm", "thigh", "shank"}
     parts = []
     for entry in yaml.safe_load(PERSON.read_text())["parts"]:
-        tuples = {key: tuple(value) for key, value in entry.items() if isinstance(value, list)}
-        part = Part(**{**entry, **tuples, "cloth": Material[entry["cloth"].upper()]})
+        vectors = {key: tuple(float(value) for value in entry[key]) for key in ("start", "axis", "size")}
+        entry |= {"scale": tuple(entry["scale"]), "cloth": Material[entry["cloth"].upper()]}
+        part = Part(**{**entry, **vectors, "taper": float(entry["taper"])})
         parts += [part.on("left"), part.on("right")] if part.body in sided else [part]
     return parts
 
@@ -393,13 +394,13 @@ class DisplayModel(nn.Module):
             ) from error
         scale = torch.stack((girths, girths, lengths), -1)
         self._constant("size", torch.tensor([part.size for part in parts]) * scale)
-        self._constant("taper", torch.tensor([float(part.taper) for part in parts]))
+        self._constant("taper", torch.tensor([part.taper for part in parts]))
         self._constant("exponent", torch.tensor([part.exponent for part in parts]))
         self._constant("segments", torch.tensor(segments))
         self._constant("materials", torch.tensor([part.cloth for part in parts]))
         self._constant("cuts", torch.tensor([part.cut(person) for part in parts]))
         self._constant(
-            "frames", torch.stack([_frame(torch.tensor(part.axis, dtype=torch.float32)) for part in parts])
+            "frames", torch.stack([_frame(torch.tensor(part.axis)) for part in parts])
         )
         self._constant("offsets", torch.tensor([part.start for part in parts]) * lengths[:, None])
         head = torch.tensor([size["head_girth"], size["neck"], size["head_girth"]])

@@ -67,7 +67,7 @@ class _Draw:
 
     def drift(self, times: Tensor, amplitude: float, fastest: float = 0.5) -> Tensor:
         """A slow, smooth wandering about 0, at most `amplitude`: three sines up to `fastest` Hz."""
-        waves = [torch.sin(math.tau * (self(0.1, fastest) * times + self(0, 1))) for _ in range(3)]
+        waves = [torch.sin(math.tau * (self(0.1, fastest) * times + self(0.0, 1.0))) for _ in range(3)]
         return amplitude / 3 * (waves[0] + waves[1] + waves[2])
 
 
@@ -118,7 +118,7 @@ def _standing(draw: _Draw, times: Tensor) -> _Figure:
 
 def _repetition(draw: _Draw, times: Tensor, period: float) -> Float[Tensor, " time"]:
     """Phase (rad) of a repeated movement: a person's tempo wanders a little."""
-    return math.tau * (times / (period * draw(0.92, 1.08)) + draw(0, 1)) + draw.drift(times, 0.35)
+    return math.tau * (times / (period * draw(0.92, 1.08)) + draw(0.0, 1.0)) + draw.drift(times, 0.35)
 
 
 def _up_and_down(phase: Float[Tensor, " time"]) -> Float[Tensor, " time"]:
@@ -133,7 +133,7 @@ def _raise_hands(sides: tuple[int, ...]) -> _Act:
         top, azimuth, bend = style(2.25, 2.75), style(0.35, 1.35), style(0.1, 0.9)
         phase = _repetition(take, times, period)
         for side in sides:
-            lift = _up_and_down(phase + take(-0.25, 0.25)) * (1 + take.drift(times, 0.05)) * take(0.92, 1.0)
+            lift = _up_and_down(phase + take(-0.12, 0.12)) * (1 + take.drift(times, 0.05)) * take(0.92, 1.0)
             hanging = figure.arms[side].clone()
             figure.arms[side, 0] = hanging[0] + (top - hanging[0]) * lift
             figure.arms[side, 1] = azimuth + take(-0.15, 0.15)
@@ -147,15 +147,15 @@ def _raise_hands(sides: tuple[int, ...]) -> _Act:
 
 def _box(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
     figure = _standing(take, times)
-    guard = torch.tensor([style(0.35, 0.7), style(0.7, 1.1), style(2.1, 2.5), style(1.6, 1.9)])
-    punch = torch.tensor([style(1.3, 1.5), style(1.35, 1.5), style(1.4, 1.6), style(1.5, 1.7)])
+    guard = times.new_tensor([style(0.15, 0.45), style(0.7, 1.1), style(2.4, 2.7), style(1.6, 1.9)])
+    punch = times.new_tensor([style(1.3, 1.5), style(1.35, 1.5), style(1.4, 1.6), style(1.5, 1.7)])
     phase = _repetition(take, times, period / 1.3)
     reach = []
     for side in (LEFT, RIGHT):
         wave = (1 + (phase + math.pi * side + take(-0.2, 0.2)).cos()) / 2
         reach.append(wave * wave * take(0.88, 1.0))
-        angles = guard[:, None] + (punch - guard)[:, None] * reach[side]
-        figure.arms[side] = angles + 0.6 * (figure.arms[side] - figure.arms[side].mean(-1, keepdim=True))
+        wander = torch.stack([take.drift(times, 0.04) for _ in guard])
+        figure.arms[side] = guard[:, None] + (punch - guard)[:, None] * reach[side] + wander
     figure.trunk[0] += style(0.1, 0.3) * (reach[LEFT] - reach[RIGHT])
     figure.trunk[1] += style(0.02, 0.15)
     return figure
@@ -167,12 +167,12 @@ def _raise_leg(side: int) -> _Act:
         lift = _up_and_down(_repetition(take, times, period)) * (1 + take.drift(times, 0.05))
         top, knee, azimuth = style(0.85, 1.35), style(0.65, 1.1), style(1.3, 1.5)
         figure.legs[side, 0] += top * take(0.92, 1.0) * lift
-        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * lift
+        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * _soon(lift)
         figure.legs[side, 2] += top * (1 - knee) * lift
         figure.legs[side, 3] = azimuth
         figure.arms[:, 0] += style(0.0, 0.2) * lift  # for balance
         figure.trunk[1] -= style(0.0, 0.08) * lift
-        return figure
+        return replace(figure, leader=-1.0 if side == LEFT else 1.0)
 
     return act
 
@@ -204,7 +204,7 @@ def _sit(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
     hands, reach = style(0.3, 0.8), style(0.4, 0.9)
     for side in (LEFT, RIGHT):
         figure.legs[side, 0] += (thigh - figure.legs[side, 0]) * down
-        figure.legs[side, 1] += (spread - figure.legs[side, 1]) * down
+        figure.legs[side, 1] += (spread - figure.legs[side, 1]) * _soon(down)
         figure.legs[side, 2] -= shank * down
         figure.legs[side, 3] = AHEAD
         figure.arms[side, 0] += (hands * take(0.9, 1.1) - figure.arms[side, 0]) * down
@@ -228,7 +228,7 @@ def _move_freely(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Fi
     for side in (LEFT, RIGHT):
         lift = _smooth(balance if side == LEFT else -balance) * take(0.5, 0.9)
         figure.legs[side, 0] += lift
-        figure.legs[side, 1] += (AHEAD - take(0, 0.5) - figure.legs[side, 1]) * (lift / (lift + 0.05))
+        figure.legs[side, 1] += (AHEAD - take(0.0, 0.5) - figure.legs[side, 1]) * _soon(lift)
         figure.legs[side, 2] -= 0.3 * lift
         figure.legs[side, 3] = AHEAD
     figure.trunk[:] += torch.stack([take.drift(times, amplitude, pace) for amplitude in (0.35, 0.15, 0.1)])
@@ -254,6 +254,13 @@ def _demonstrate(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Fi
     figure.arms[LEFT, 0] -= 0.2 * step
     figure.arms[RIGHT, 2] += 0.35 * step
     return replace(figure, leader=-1.0)
+
+
+def _soon(lift: Tensor) -> Tensor:
+    """How far a limb has found its plane, 0 to 1: long before it is up, so that it does not swing out
+    sideways.
+    """
+    return lift / (lift + 0.05)
 
 
 def _smooth(x: Tensor) -> Tensor:
@@ -303,7 +310,7 @@ def perform(
     style, draw = _Draw("style", motion, person), _Draw("take", motion, person, take)
     place = _Draw("place", person, take, motion)
     figure = _ACTS[motion](style, draw, times, place(*config.period))
-    heading = 0.25 * place(-1, 1) if motion == "demo" else config.heading * place(-1, 1)
+    heading = 0.25 * place(-1.0, 1.0) if motion == "demo" else config.heading * place(-1.0, 1.0)
     turn, lean, tilt = figure.trunk
     nod, aslant = figure.head
     leaning = exp_rotation(_along(1, turn)) @ exp_rotation(_along(0, lean)) @ exp_rotation(_along(2, tilt))
@@ -317,7 +324,7 @@ def perform(
     pose = body.pose_from_directions(torch.zeros_like(angles), angles, directions)
     pose = torch.maximum(torch.minimum(pose, body.high), body.low)
     near, far = _distances(body, size, camera, config)
-    spot = torch.tensor([config.aside * place(-1, 1), place(near, far)]).to(size)
+    spot = torch.tensor([config.aside * place(-1.0, 1.0), place(near, far)]).to(size)
     return torch.cat((_stand(body, size, pose, figure, heading, spot, config.floor), pose[:, 3:]), -1)
 
 

@@ -75,7 +75,7 @@ class StereoFrames:
 
 
 @dataclass(frozen=True)
-class _Posed:
+class PosedShapes:
     """One frame's super-quadrics in the frame of one eye."""
 
     shapes: Superquadric
@@ -93,12 +93,12 @@ class _Posed:
         behind = (z <= 0).any(1, keepdim=True)
         return torch.cat((low.masked_fill(behind, -math.inf), high.masked_fill(behind, math.inf)), -1)
 
-    def seen_from(self, eye: Float[Tensor, "3"], turn: Float[Tensor, "3 3"] | None = None) -> "_Posed":
+    def seen_from(self, eye: Float[Tensor, "3"], turn: Float[Tensor, "3 3"] | None = None) -> "PosedShapes":
         """The same from another eye, whose axes are the columns of `turn` (None: the same axes)."""
         origins = self.origins - eye
         if turn is None:
-            return _Posed(self.shapes, self.rotations, origins)
-        return _Posed(self.shapes, turn.mT @ self.rotations, origins @ turn)
+            return PosedShapes(self.shapes, self.rotations, origins)
+        return PosedShapes(self.shapes, turn.mT @ self.rotations, origins @ turn)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Hits:
     part: Int[Tensor, " num"]  # -1 where nothing
 
 
-def cast(posed: _Posed, rays: Float[Tensor, "num 3"]) -> Hits:
+def cast(posed: PosedShapes, rays: Float[Tensor, "num 3"]) -> Hits:
     """The nearest part on each ray from the eye (z = 1). Only the rays in a part's bounds are tried on it."""
     bounds = posed.bounds()
     x, y = rays[:, :1], rays[:, 1:2]
@@ -119,7 +119,7 @@ def cast(posed: _Posed, rays: Float[Tensor, "num 3"]) -> Hits:
     to_part = posed.rotations.mT
     start = -(to_part @ posed.origins[..., None])[..., 0]
     direction = (to_part[part] * rays[ray][:, None]).sum(-1)
-    depth = intersect(start[part], direction, posed.shapes[part])
+    depth = intersect(start[part], direction, posed.shapes[part], steps=12)
     nearest = torch.full_like(rays[:, 0], math.inf).scatter_reduce(0, ray, depth, "amin")
     first = torch.isfinite(depth) & (depth == nearest[ray])
     winner = torch.full_like(ray.new_empty(len(rays)), len(bounds)).scatter_reduce(
@@ -131,7 +131,7 @@ def cast(posed: _Posed, rays: Float[Tensor, "num 3"]) -> Hits:
 class _Shadow:
     """The person's shadow: a map of what the lamp sees, in the plane of its slopes x/z, y/z."""
 
-    def __init__(self, posed: _Posed, size: int):
+    def __init__(self, posed: PosedShapes, size: int):
         bounds = posed.bounds()
         low, high = bounds[:, :2].amin(0).clamp_min(-3), bounds[:, 2:].amax(0).clamp_max(3)
         self.middle, self.half = (low + high) / 2, 0.6 * (high - low)  # a margin for the blur
@@ -162,8 +162,8 @@ class StereoRenderer(nn.Module):
     """Renders one person in one room for one stereo camera.
 
     The room is cast when the renderer is made, then each frame costs the person and the noise. The noise of
-    frame i comes from a random stream of its own, so frames may be rendered in any order and grouping. Raises
-    ValueError for a camera without a baseline.
+    frame i comes from a random stream of its own, named after `seed` and i, so frames may be rendered in any
+    order and grouping. Raises ValueError for a camera without a baseline.
     """
 
     eyes: Tensor
@@ -185,7 +185,7 @@ class StereoRenderer(nn.Module):
         body: BodyModel,
         person: Person,
         config: RenderConfig = RenderConfig(),
-        seed: int = 0,
+        seed: int | str = 0,
     ):
         super().__init__()
         if camera.baseline is None:
@@ -205,7 +205,7 @@ class StereoRenderer(nn.Module):
         self._constant("bodies", torch.tensor(self.display.bodies))
         shifts = torch.rand(len(body.body_names), 3, generator=random_stream("limbs", person.pattern))
         self._constant("shifts", shifts)  # m: each limb is cut from another place of the cloth
-        self._see_room(Room(config.room, random_stream("room", seed)))
+        self._see_room(Room(config.room, random_stream("room", config.room.seed)))
 
     def _constant(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
@@ -241,7 +241,7 @@ class StereoRenderer(nn.Module):
         parts = self.display(posed)
         frames = []
         for i, (rotations, origins) in enumerate(zip(parts.rotations, parts.origins, strict=True)):
-            scene = _Posed(self.display.shapes, rotations, origins)
+            scene = PosedShapes(self.display.shapes, rotations, origins)
             shadow = _Shadow(scene.seen_from(self.light, self.lamp), self.config.shadow_map)
             (left, depth, labels), (right, _, _) = (self._draw(scene, shadow, eye) for eye in (0, 1))
             noisy = [
@@ -250,7 +250,7 @@ class StereoRenderer(nn.Module):
             frames.append((*noisy, depth, labels))
         return StereoFrames(*(torch.stack(column) for column in zip(*frames, strict=True)))
 
-    def _draw(self, scene: _Posed, shadow: _Shadow, eye: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _draw(self, scene: PosedShapes, shadow: _Shadow, eye: int) -> tuple[Tensor, Tensor, Tensor]:
         """One view without noise: RGB (3, H, W), depth (H, W) and labels (H, W)."""
         posed = scene.seen_from(self.eyes[eye])
         image = self.ambient[eye] + self.direct[eye] * (1 - shadow.on_room(self.slopes[eye]))
@@ -279,7 +279,7 @@ class StereoRenderer(nn.Module):
         labels[rows, columns] = torch.where(part >= 0, self.display.segments[part] + 1, 0)
         return image, depth, labels
 
-    def _window(self, posed: _Posed) -> tuple[slice, slice]:
+    def _window(self, posed: PosedShapes) -> tuple[slice, slice]:
         """Rows and columns of the image that hold the whole person."""
         bounds, camera = posed.bounds(), self.camera
         low = bounds[:, :2].amin(0) * camera.focal_length
@@ -298,7 +298,7 @@ class StereoRenderer(nn.Module):
 
     def _see(
         self,
-        posed: _Posed,
+        posed: PosedShapes,
         shadow: _Shadow,
         eye: int,
         pixels: Float[Tensor, "num 2"],
@@ -317,7 +317,7 @@ class StereoRenderer(nn.Module):
 
     def _shade(
         self,
-        posed: _Posed,
+        posed: PosedShapes,
         shadow: _Shadow,
         eye: int,
         points: Float[Tensor, "num 3"],

@@ -25,6 +25,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class RoomConfig:
+    seed: int = 0  # which furniture, colours and textures
     camera_height: float = 1.1  # m above the floor
     depth: float = 4.9  # m, the back wall
     width: float = 5.6  # m, between the side walls, the camera in the middle
@@ -131,7 +132,7 @@ def furnish(config: RoomConfig, generator: torch.Generator) -> list[Box]:
 
     floor, back = config.camera_height, config.depth
     skirting = (config.width, 0.1, 0.04)
-    boxes = [Box((0, floor - 0.05, back), skirting, (0.36, 0.30, 0.26), grain=(0.25, 1, 1))]
+    boxes = [Box((0.0, floor - 0.05, back), skirting, (0.36, 0.30, 0.26), grain=(0.25, 1.0, 1.0))]
     for side in (-1, 1):
         width, tall, deep = uniform(0.7, 1.0), uniform(0.6, 1.0), uniform(0.4, 0.5)
         x, z = side * uniform(1.5, 1.75), back - deep / 2 - uniform(0.05, 0.25)
@@ -152,9 +153,9 @@ def furnish(config: RoomConfig, generator: torch.Generator) -> list[Box]:
         boxes.append(Box(picture, (wide + 0.05, high + 0.05, 0.05), colour(0.1, 0.35)))
         boxes.append(Box(picture, (wide, high, 0.06), colour(0.4, 0.7), 0.0, 0.15, 0.33))
     crate = uniform(0.3, 0.42)
-    x = (-1 if uniform(0, 1) < 0.5 else 1) * uniform(1.35, 1.6)
+    x = (-1 if uniform(0.0, 1.0) < 0.5 else 1) * uniform(1.35, 1.6)
     boxes.append(
-        Box((x, floor - crate / 2, uniform(3.5, 3.9)), (crate,) * 3, colour(), uniform(0, 1.5), 0.15, 0.06)
+        Box((x, floor - crate / 2, uniform(3.5, 3.9)), (crate,) * 3, colour(), uniform(0.0, 1.5), 0.15, 0.06)
     )
     return boxes
 
