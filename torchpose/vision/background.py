@@ -243,9 +243,9 @@ def search_region(
 
 def person_silhouette(
     log_odds: Planes,
-    depth: Planes,
+    depth: Float[Tensor, "batch depth_height depth_width"],
     config: SilhouetteConfig = SilhouetteConfig(),
-    background_depth: Plane | None = None,
+    background_depth: Float[Tensor, "background_height background_width"] | None = None,
     camera: StereoCamera | None = None,
 ) -> Silhouette:
     """The person's silhouette: foreground of the background model, refined by depth (T. Fig. 3.6).

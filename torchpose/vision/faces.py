@@ -84,8 +84,8 @@ class FaceDetector:
     def __call__(
         self,
         images: Float[Tensor, "batch 3 height width"],
-        silhouette: Bool[Tensor, "batch height width"],
-        depth: Float[Tensor, "batch height width"],
+        silhouette: Bool[Tensor, "batch mask_height mask_width"],
+        depth: Float[Tensor, "batch depth_height depth_width"],
         camera: StereoCamera,
     ) -> Faces:
         """Faces in the upper part of the silhouette, of a width that is plausible at their depth.

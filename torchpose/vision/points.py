@@ -75,7 +75,7 @@ class Cells:
 
 def sample_grid(
     depth: Float[Tensor, "batch height width"],
-    silhouette: Bool[Tensor, "batch height width"],
+    silhouette: Bool[Tensor, "batch mask_height mask_width"],
     camera: StereoCamera,
     config: SamplingConfig = SamplingConfig(),
 ) -> PointCloud:
