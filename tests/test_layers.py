@@ -15,7 +15,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the ground": ("atomic", "geometry", "least_squares"),
     "vision": ("camera", "windows", "photometry", "stereo", "background", "points", "faces"),
     "body": ("skeleton", "model", "ellipsoid", "superquadric", "angle"),
-    "registration": ("likelihood", "labelling", "fitting", "silhouette", "vem", "start"),
+    "registration": ("likelihood", "labelling", "geodesic", "fitting", "silhouette", "vem", "start"),
     "tracking": ("kalman", "meanshift", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),

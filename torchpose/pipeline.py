@@ -19,6 +19,7 @@ from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_
 from torchpose.body.model import BodyConfig, BodyModel
 from torchpose.export import PoseSequence
 from torchpose.recording import Backgrounds, Frame, Recording, UnreadableFrame
+from torchpose.registration.geodesic import geodesic_bounds, geodesic_term
 from torchpose.registration.likelihood import (
     AppearanceConfig,
     Evidence,
@@ -42,7 +43,7 @@ from torchpose.vision.background import (
 )
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.faces import FaceConfig, FaceDetector, Faces
-from torchpose.vision.points import PointCloud, SamplingConfig, sample_grid
+from torchpose.vision.points import CellConfig, PointCloud, SamplingConfig, group_cells, sample_grid
 from torchpose.vision.stereo import GrowingSeeds, GrowingSeedsConfig
 
 
@@ -79,6 +80,7 @@ class PoseConfig:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     height: float = 0.0  # m, of the person; 0 measures it
     height_frames: int = 8  # of the recording, from which it is measured
+    cells: CellConfig = field(default_factory=CellConfig)  # of the geodesic term
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,12 @@ class StereoToPose(nn.Module):
         """A sight as registration takes it."""
         evidence = Evidence(sight.images, sight.silhouette, sight.cloud, sight.faces)
         potential = appearance_potential(list(self.likelihoods), evidence, self.body.num_parts)
-        return Observation(sight.cloud, potential, nearest_inside(sight.silhouette), self.camera)
+        geodesic = None
+        if self.config.registration.labelling.geodesic > 0:
+            cells = group_cells(sight.cloud, self.config.cells)
+            bounds = geodesic_bounds(self.body, self.size)
+            geodesic = geodesic_term(cells, bounds, outlier=self.config.registration.outlier > 0)
+        return Observation(sight.cloud, potential, nearest_inside(sight.silhouette), self.camera, geodesic)
 
     def prepare(self, recording: Recording) -> None:
         """Learn the recording's background and the person's height."""

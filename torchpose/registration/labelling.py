@@ -44,7 +44,8 @@ class Labelling:
     """Beliefs after the VE-step."""
 
     belief: Float[Tensor, "batch labels num"]  # q_i(v); 0 on padding
-    bound: Float[Tensor, "sweeps_1 batch"]  # the part of (C.8) that labels change, before and after each sweep
+    bound: Float[Tensor, "sweeps_1 batch"]  # the part of (C.8) that labels change, before and after each sweep;
+    # without the geodesic term, whose hardened cells have no bound
 
 
 def mean_field(
@@ -112,17 +113,21 @@ def label_bound(
 def _geodesic_field(
     belief: Float[Tensor, "batch labels num"], term: GeodesicTerm, strength: float
 ) -> Float[Tensor, "batch labels num"]:
-    """Sum over cells of log P_geo (3.12), each cell hardened to its best label as in T."""
+    """Sum over cells of log P_geo (3.12), each cell hardened to its best label as in T.
+
+    A cell with label w speaks with alpha = strength M_c / M_w, so all cells that may carry w together with strength M_c.
+    """
     B, L, _ = belief.shape
     C = term.distance.shape[1]
     slot = torch.where(term.cell < 0, C, term.cell)
     total = belief.new_zeros(B, L, C + 1).scatter_add_(2, slot[:, None].expand(-1, L, -1), belief)
-    count = total[..., :C].sum(1)  # beliefs of a point sum to one
-    hard = torch.nn.functional.one_hot(total[..., :C].argmax(1), L).to(belief) * (count > 0)[..., None]
+    seen = total[..., :C].sum(1) > 0
+    label = total[..., :C].argmax(1)  # (B, C), w
     distance = term.distance[:, None]  # (B, 1, C, C): from the point's cell to the other
-    shortest, longest = hard @ term.shortest.mT, hard @ term.longest.mT  # (B, C, L): for a point labelled v
-    weight = strength / (hard @ term.most.clamp_min(1 / C)).clamp_min(1e-6) / C * (count > 0)
-    outside = (distance < shortest.mT[:, :, None]) | (distance > longest.mT[:, :, None])
+    # (B, L, 1, C), for a point labelled v. Not a product with one-hot labels: 0 times an infinite bound is NaN.
+    shortest, longest = term.shortest[:, label].transpose(0, 1)[:, :, None], term.longest[:, label].transpose(0, 1)[:, :, None]
+    weight = strength / term.most.clamp_min(1 / C)[label] * seen  # alpha = beta of (3.12)
+    outside = (distance < shortest) | (distance > longest)
     # Cells on another piece of the cloud say nothing: the way between them was not seen.
     outside = outside & distance.isfinite()
     field = -(outside.to(belief) * weight[:, None, None]).sum(-1)  # (B, L, C)
