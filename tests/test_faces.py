@@ -1,0 +1,173 @@
+"""The face: a photograph that ships with scikit-image, what is no face in it, and the rendered people."""
+
+import cv2
+import pytest
+import skimage.data
+import torch
+from torch.testing import assert_close
+
+from torchpose.vision.camera import StereoCamera
+from torchpose.vision.faces import FaceConfig, FaceDetector
+
+CAMERA = StereoCamera(512, 512, 690.0, 250.0, 260.0, 0.12)
+FACE = (175.0, 65.0, 275.0, 180.0)  # of the astronaut: x0, y0, x1, y1 from the hairline to the chin
+
+
+def astronaut():
+    return torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / 255
+
+
+def upper_body():
+    """The astronaut's silhouette, by hand, and a depth that makes her face 0.15 m wide."""
+    mask = torch.zeros(1, 512, 512, dtype=torch.bool)
+    mask[:, 10:200, 150:300] = True  # head
+    mask[:, 200:, 30:420] = True
+    return mask, torch.where(mask, 1.0, torch.nan)
+
+
+def within(box, region):
+    x, y = float(box[0] + box[2]) / 2, float(box[1] + box[3]) / 2
+    return region[0] < x < region[2] and region[1] < y < region[3]
+
+
+@pytest.mark.parametrize("brightness", [1.0, 0.5, 0.3])
+def test_a_face_is_found_in_light_and_in_shade(brightness):
+    mask, depth = upper_body()
+    faces = FaceDetector()(brightness * astronaut(), mask, depth, CAMERA)
+    assert faces.found.tolist() == [True]
+    box = faces.box[0]
+    assert within(box, (205, 90, 245, 150))
+    assert 80 < float(box[2] - box[0]) < 150
+    # The position is the box's centre, back-projected: u right, v down, about the principal point.
+    middle = 0.5 * (box[:2] + box[2:])
+    expected = torch.tensor([(middle[0] - 250) / 690, (middle[1] - 260) / 690, 1.0])
+    assert_close(faces.position[0], expected)
+    assert expected[1] < -0.15  # above the axis, so y is negative
+    v, u = faces.mask[0].nonzero().unbind(1)
+    assert (faces.mask & ~mask).sum() == 0
+    assert box[0] <= u.min() < u.max() <= box[2]
+    assert box[1] <= v.min() < v.max() <= box[3]
+    area = float((box[2] - box[0]) * (box[3] - box[1]))
+    assert_close(float(faces.mask.sum()), torch.pi / 4 * area, rtol=0.01, atol=0)  # an ellipse
+
+
+def test_a_mirrored_face_is_found_mirrored():
+    mask, depth = upper_body()
+    faces = FaceDetector()(astronaut().flip(3), mask.flip(2), depth.flip(2), CAMERA)
+    assert within(faces.box[0], (511 - 245, 90, 511 - 205, 150))
+
+
+def test_without_depth_the_silhouettes_height_stands_in_and_there_is_no_position():
+    image = torch.zeros(1, 3, 1180, 512)
+    image[:, :, :512] = astronaut()
+    mask = torch.zeros(1, 1180, 512, dtype=torch.bool)
+    mask[:, :512] = upper_body()[0]
+    mask[:, 512:, 100:350] = True  # 1170 px, 1.7 m at 1 m
+    camera = StereoCamera(512, 1180, 690.0, 250.0, 260.0, 0.12)
+    faces = FaceDetector()(image, mask, torch.full((1, 1180, 512), torch.nan), camera)
+    assert faces.found.tolist() == [True]
+    assert within(faces.box[0], FACE)
+    assert faces.position.isnan().all()
+
+
+def blue(image, mask, depth):
+    return image.flip(1), mask, depth
+
+
+def far(image, mask, depth):
+    return image, mask, 4 * depth  # then the face would be 0.6 m wide
+
+
+def near(image, mask, depth):
+    return image, mask, 0.3 * depth
+
+
+def beside(image, mask, depth):
+    mask = mask.clone()
+    mask[:, :200] = False  # the head is not the person's
+    return image, mask, depth
+
+
+def nobody(image, mask, depth):
+    return image, torch.zeros_like(mask), depth
+
+
+def low(image, mask, depth):
+    """The head between the feet: all that is above it is silhouette."""
+    down = 260
+    image, mask = image.roll(down, 2), torch.ones_like(mask)
+    return image, mask, torch.ones_like(depth)
+
+
+def no_face(image, mask, depth):
+    brick = torch.from_numpy(skimage.data.brick())[None, None].float() / 255
+    tint = torch.tensor([0.9, 0.6, 0.45])[:, None, None]  # the colour of skin
+    return brick * tint, mask, depth
+
+
+@pytest.mark.parametrize("spoil", [blue, far, near, beside, nobody, low, no_face])
+def test_what_is_no_face(spoil):
+    image, mask, depth = spoil(astronaut(), *upper_body())
+    faces = FaceDetector()(image, mask, depth, CAMERA)
+    assert faces.found.tolist() == [False]
+    assert faces.box.isnan().all()
+    assert faces.position.isnan().all()
+    assert not faces.mask.any()
+
+
+def test_batch_equals_one_by_one():
+    mask, depth = upper_body()
+    images = torch.cat([astronaut(), astronaut().flip(1), astronaut().flip(3)])
+    masks, depths = torch.cat([mask, mask, mask.flip(2)]), torch.cat([depth, depth, 1.1 * depth.flip(2)])
+    detector = FaceDetector()
+    together = detector(images, masks, depths, CAMERA)
+    assert together.found.tolist() == [True, False, True]
+    for k in range(3):
+        alone = detector(images[k : k + 1], masks[k : k + 1], depths[k : k + 1], CAMERA)
+        for name in ("box", "found", "mask", "position"):
+            assert_close(getattr(together, name)[k : k + 1], getattr(alone, name), equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: FaceConfig(min_width=0.3), "min_width"),
+        (lambda: FaceConfig(scale_step=1.0), "scale_step"),
+        (lambda: FaceConfig(face_pixels=10), "face_pixels"),
+        (lambda: FaceConfig(search_height=0.0), "search_height"),
+        (lambda: FaceConfig(min_skin=1.5), "min_skin"),
+        (
+            lambda: FaceDetector()(astronaut(), upper_body()[0][:, :100], upper_body()[1], CAMERA),
+            "images' size",
+        ),
+    ],
+)
+def test_bad_input_is_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+@pytest.mark.parametrize(
+    "name", ["elbow_horizontal_m2", "knee_lifts_m2", "punch_m2", "shoulder_raising_m2", "walking_m2"]
+)
+def test_rendered_people_have_a_face(shared_data, name):
+    """Dark skin, 2.5 to 4.5 m away, up to 36 degrees aside; measured on every 4th frame: 73 of 75."""
+    folder = shared_data / "people" / name
+    if not folder.is_dir():
+        pytest.skip(f"no folder {folder}")
+    camera = StereoCamera(640, 480, 720.0, 318.3, 241.7, 0.121)
+    frames = (0, 16, 40)
+
+    def load(what, flags):
+        images = [cv2.imread(str(folder / what.format(k)), flags) for k in frames]
+        return torch.stack([torch.from_numpy(image.copy()) for image in images])
+
+    colour = load("left/{:06d}.jpg", cv2.IMREAD_COLOR).flip(3).permute(0, 3, 1, 2).float() / 255
+    label = load("truth/{:06d}_label.png", cv2.IMREAD_UNCHANGED)
+    depth = load("truth/{:06d}_depth.png", cv2.IMREAD_UNCHANGED).float() / 1000
+    faces = FaceDetector()(colour, label > 0, torch.where(label > 0, depth, torch.nan), camera)
+    assert int(faces.found.sum()) >= (2 if name == "punch_m2" else 3)  # punching, he looks aside
+    for k in range(3):
+        if faces.found[k]:
+            on_head = ((label[k] == 1) | (label[k] == 2))[faces.mask[k]]
+            assert on_head.float().mean() > 0.9
