@@ -1,10 +1,11 @@
-"""The M-step: the pose that brings the body's points to their targets, by Levenberg-Marquardt (T. 3.24, App. E).
+"""The M-step: the pose that brings the body's points to their targets (T. 3.24, App. E).
 
-Every measurement is a row: a point fixed to a part, a target in the camera's frame and a direction along which their
-difference counts. Metres; a direction is divided by the row's standard deviation, so residuals have no unit.
+Every measurement is a row: a point fixed to a part, a target in the camera's frame and a direction along
+which their difference counts. Metres; a direction is divided by the row's standard deviation, so residuals
+have no unit.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import torch
@@ -32,7 +33,8 @@ class JacobianKind(Enum):
 @dataclass(frozen=True)
 class FittingConfig:
     jacobian: JacobianKind = JacobianKind.geometric
-    lm: LMConfig = LMConfig(max_steps=2)  # per round; correspondences are renewed in between
+    # A round's steps: correspondences are renewed in between.
+    lm: LMConfig = field(default_factory=lambda: LMConfig(max_steps=2))
     limit_sd: float = 0.05  # rad beyond a joint's limit that cost as much as one sigma; 0 switches limits off
 
     def __post_init__(self) -> None:
@@ -48,6 +50,13 @@ class Rows:
     local: Float[Tensor, "batch rows 3"]  # m, the model's point in its part's frame
     target: Float[Tensor, "batch rows 3"]  # m, camera's frame
     direction: Float[Tensor, "batch rows 3"]  # 1/m, camera's frame: unit direction / standard deviation
+
+    def points(self, posed: PosedBody) -> Float[Tensor, "batch rows 3"]:
+        """The model's points in the camera's frame, m."""
+        index = self.part[..., None]
+        frames = posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3))
+        centers = posed.centers.gather(1, index.expand(-1, -1, 3))
+        return (frames @ self.local[..., None])[..., 0] + centers
 
     @staticmethod
     def cat(*rows: "Rows") -> "Rows":
@@ -86,7 +95,7 @@ def pose_residual(
 
     def residual(pose: Tensor) -> Tensor:
         posed = body(pose, size)
-        gap = rows.target - model_points(posed, rows)
+        gap = rows.target - rows.points(posed)
         return torch.cat([(rows.direction * gap).sum(-1), *_pose_terms(body, pose, prior, config)], 1)
 
     return residual
@@ -95,17 +104,18 @@ def pose_residual(
 def linearize_by_screws(
     body: BodyModel, size: Float[Tensor, "#batch sizes"], rows: Rows, prior: PosePrior, config: FittingConfig
 ) -> Linearize:
-    """The same residuals with their Jacobian in closed form: a row of it is (p x n, n) against each joint's screw.
+    """The same residuals with their Jacobian in closed form: rows are (p x n, n) against each joint's screw.
 
-    With the screw S = (w, o x w) of an axis w through o, n . (w x (p - o)) = (p x n, n) . S; a translation along w is
-    the screw (0, w). One product serves all rows and joints; rows of parts that a joint does not move are masked.
+    With the screw S = (w, o x w) of an axis w through o, n . (w x (p - o)) = (p x n, n) . S; a translation
+    along w is the screw (0, w). One product serves all rows and joints; rows of parts that a joint does not
+    move are masked.
     """
     moves = body.part_moves.to(rows.direction)[rows.part]  # (B, R, P)
     slope = prior.precision.sqrt()
 
     def linearize(pose: Tensor) -> tuple[Tensor, Tensor]:
         posed = body(pose, size)
-        points = model_points(posed, rows)
+        points = rows.points(posed)
         wrench = torch.cat([torch.linalg.cross(points, rows.direction), rows.direction], -1)
         turning = torch.cat([posed.screw_axes, torch.linalg.cross(posed.screw_origins, posed.screw_axes)], -1)
         sliding = torch.cat([torch.zeros_like(posed.screw_axes), posed.screw_axes], -1)
@@ -120,14 +130,6 @@ def linearize_by_screws(
         return residual, torch.cat(jacobian, 1)
 
     return linearize
-
-
-def model_points(posed: PosedBody, rows: Rows) -> Float[Tensor, "batch rows 3"]:
-    """The rows' model points in the camera's frame, m."""
-    index = rows.part[..., None]
-    frames = posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3))
-    centers = posed.centers.gather(1, index.expand(-1, -1, 3))
-    return (frames @ rows.local[..., None])[..., 0] + centers
 
 
 def _pose_terms(body: BodyModel, pose: Tensor, prior: PosePrior, config: FittingConfig) -> list[Tensor]:

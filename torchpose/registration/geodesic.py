@@ -1,8 +1,8 @@
 """Geodesic distances that the body allows between its parts, for the pairwise term of the labels (T. 3.12).
 
-The way over the body's surface between two points hardly changes while the body moves: it follows the skeleton, and
-inside a rigid body nothing moves at all. So the bounds come from the skeleton and the girths, not from sampled poses.
-Metres.
+The way over the body's surface between two points hardly changes while the body moves: it follows the
+skeleton, and inside a rigid body nothing moves at all. So the bounds come from the skeleton and the girths,
+not from sampled poses. Metres.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,10 @@ from torchpose.body.model import BodyModel, PosedBody
 from torchpose.registration.labelling import GeodesicTerm
 from torchpose.vision.points import Cells, shortest_paths
 
-RINGS, SPOKES = 16, 12  # points on a spheroid's surface, from which its farthest one is taken: within 2 % of its size
+RINGS, SPOKES = (
+    16,
+    12,
+)  # points all over a spheroid; the farthest of them is within 2 % of the farthest of all
 
 
 @dataclass(frozen=True)
@@ -34,16 +37,16 @@ def geodesic_bounds(
 ) -> GeodesicBounds:
     """Bounds of the geodesic distance between any two points of two parts, over all poses.
 
-    The way along the skeleton between two surface points is theirs to the first and from the last joint, and between
-    them the distances of joints on one rigid body: none of it depends on the pose. A way through the body passes every
-    joint between within the girth r there, so it is at most 2 r a joint shorter. Over the surface it may go half
-    around a bent joint (pi r) and half around either part (pi r instead of 2 r).
+    The way along the skeleton between two surface points is theirs to the first and from the last joint, and
+    between them the distances of joints on one rigid body: none of it depends on the pose. A way through the
+    body passes every joint between within the girth r there, so it is at most 2 r a joint shorter. Over the
+    surface it may go half around a bent joint (pi r) and half around either part (pi r instead of 2 r).
 
     `most` is the share of a part when every part is seen broadside, by the areas of their outlines.
 
     Args:
         margin: m, added on both sides: cells are centres of pieces of the surface.
-        stretch: ratio by which ways over the graph of cells are longer than over the surface, see `group_cells`.
+        stretch: ratio of ways over the graph of cells to those over the surface, see `group_cells`.
     """
     posed = body(size.new_zeros(1, body.num_parameters), size)
     between = _joints_between(body).to(posed.centers)  # (K, K, J)
@@ -61,7 +64,7 @@ def geodesic_bounds(
 
 
 def geodesic_term(cells: Cells, bounds: GeodesicBounds, outlier: bool) -> GeodesicTerm:
-    """A frame's cells with the body's bounds. With `outlier` there is a last label "no part", which is never bound."""
+    """A frame's cells with the body's bounds. With `outlier` the last label is "no part", unbound."""
     shortest, longest, most = bounds.shortest, bounds.longest, bounds.most
     if outlier:
         pad = torch.nn.functional.pad
@@ -102,8 +105,10 @@ def _ways(body: BodyModel, posed: PosedBody) -> Float[Tensor, "joints joints"]:
     return shortest_paths(length, torch.ones_like(own[:1]))[0]
 
 
-def _reaches(body: BodyModel, posed: PosedBody) -> tuple[Float[Tensor, "parts joints"], Float[Tensor, "parts joints"]]:
-    """Least and greatest distance of each part's points from the joints of its rigid body, m; inf from others."""
+def _reaches(
+    body: BodyModel, posed: PosedBody
+) -> tuple[Float[Tensor, "parts joints"], Float[Tensor, "parts joints"]]:
+    """Least and greatest distance (m) of each part from the joints of its rigid body; inf from others."""
     local = (posed.origins[:, None, 1:] - posed.centers[:, :, None]) @ posed.frames  # (1, K, J, 3)
     a, c = posed.radii.unbind(-1)
     inside = (local / torch.stack([a, a, c], -1)[:, :, None]).norm(dim=-1) < 1
@@ -115,10 +120,10 @@ def _reaches(body: BodyModel, posed: PosedBody) -> tuple[Float[Tensor, "parts jo
 
 def _surface(posed: PosedBody) -> Float[Tensor, "1 parts points 3"]:
     """Points all over each spheroid, in its own frame, m."""
-    like = {"dtype": posed.radii.dtype, "device": posed.radii.device}
-    polar = torch.linspace(0, pi, RINGS + 1, **like)[:, None]
-    turn = torch.arange(SPOKES, **like) * (2 * pi / SPOKES)
-    ball = torch.stack([polar.sin() * turn.cos(), polar.sin() * turn.sin(), polar.cos().expand(-1, SPOKES)], -1)
+    polar = torch.linspace(0, pi, RINGS + 1).to(posed.radii)[:, None]
+    turn = torch.arange(SPOKES).to(posed.radii) * (2 * pi / SPOKES)
+    x, y = polar.sin() * turn.cos(), polar.sin() * turn.sin()
+    ball = torch.stack([x, y, polar.cos().expand_as(x)], -1)
     a, c = posed.radii.unbind(-1)
     return ball.flatten(0, 1) * torch.stack([a, a, c], -1)[:, :, None]
 
@@ -133,7 +138,9 @@ def _extents(posed: PosedBody) -> Float[Tensor, "parts parts"]:
 def _over_joints(
     reach: Float[Tensor, "parts joints"], ways: Float[Tensor, "joints joints"]
 ) -> Float[Tensor, "parts parts"]:
-    """Part to first joint, along the skeleton, last joint to part. The least over the joints is the way of the tree:
-    a joint that is not on it only adds, by the triangle's inequality."""
+    """Part to first joint, along the skeleton, last joint to part.
+
+    The least over the joints is the way of the tree: by the triangle's inequality any other joint only adds.
+    """
     to_joint = (reach[:, :, None] + ways).amin(1)
     return (to_joint[:, None] + reach).amin(-1)

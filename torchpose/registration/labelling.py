@@ -1,7 +1,7 @@
-"""The VE-step: a mean field over the body part of each point, with a Potts and a geodesic term (T. 3.18 to 3.21).
+"""The VE-step: a mean field over the points' body parts, with Potts and geodesic terms (T. 3.18 to 3.21).
 
-Labels stand before points, (B, L, N): the softmax over labels is then nine times faster. The last label may mean
-"no part". Probabilities and log-potentials have no unit, geodesic distances are in metres.
+Labels stand before points, (B, L, N): the softmax over labels is then nine times faster. The last label may
+mean "no part". Probabilities and log-potentials have no unit, geodesic distances are in metres.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-# Grid neighbours within radius 2 never share (row + 2 column) mod 5: five sets that can each be updated at once.
+# Grid neighbours within radius 2 never share (row + 2 column) mod 5: five sets, each updated at once.
 COLOURS = 5
 
 
@@ -18,14 +18,18 @@ COLOURS = 5
 class LabellingConfig:
     sweeps: int = 3  # at sigma <= 5 cm the field settles in 3 to 4
     potts: float = 0.5  # gamma of (3.8)
-    coloured: bool = False  # update one independent set after another: the bound then never falls, at 5 times the cost
-    geodesic: float = 0.0  # alpha = beta of (3.12) times M_v / M_c; T. has 0.04. Off: it costs accuracy, see the docs
+    # Update one independent set after another: the bound then never falls, at 5 times the cost. For the
+    # neighbours within radius 2.
+    coloured: bool = False
+    geodesic: float = 0.0  # alpha = beta of (3.12) times M_v / M_c; T. has 0.04. Off: it costs accuracy
 
     def __post_init__(self) -> None:
         if self.sweeps < 0:
-            raise ValueError(f"sweeps must not be negative, got {self.sweeps}; 0 labels each point on its own")
+            raise ValueError(f"sweeps must not be negative, got {self.sweeps}; 0 labels each point alone")
         if self.potts < 0 or self.geodesic < 0:
-            raise ValueError(f"potts and geodesic must not be negative, got {self.potts} and {self.geodesic}")
+            raise ValueError(
+                f"potts and geodesic must not be negative, got {self.potts} and {self.geodesic}; 0 is off"
+            )
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,9 @@ class Labelling:
     """Beliefs after the VE-step."""
 
     belief: Float[Tensor, "batch labels num"]  # q_i(v); 0 on padding
-    bound: Float[Tensor, "sweeps_1 batch"]  # the part of (C.8) that labels change, before and after each sweep;
-    # without the geodesic term, whose hardened cells have no bound
+    # The part of (C.8) that labels change, before and after each sweep. Without the geodesic term, whose
+    # hardened cells have no bound.
+    bound: Float[Tensor, "sweeps_1 batch"]
 
 
 def mean_field(
@@ -56,7 +61,7 @@ def mean_field(
     grid: Int[Tensor, "batch num 2"] | None = None,
     geodesic: GeodesicTerm | None = None,
 ) -> Labelling:
-    """Beliefs q_i(v) ~ exp(f_i(v) + gamma sum_j q_j(v) + sum_cells g(v, v_j)), sweep by sweep (3.20), from softmax(f).
+    """q_i(v) ~ exp(f_i(v) + gamma sum_j q_j(v) + sum_cells g(v, v_j)) (3.20), starting at softmax(f) (3.21).
 
     Args:
         potential: f_i(v), log-potentials of each point alone.
@@ -115,7 +120,7 @@ def _geodesic_field(
 ) -> Float[Tensor, "batch labels num"]:
     """Sum over cells of log P_geo (3.12), each cell hardened to its best label as in T.
 
-    A cell with label w speaks with alpha = strength M_c / M_w, so all cells that may carry w together with strength M_c.
+    A cell with label w speaks with alpha = strength M_c / M_w: all that may carry w speak with strength M_c.
     """
     B, L, _ = belief.shape
     C = term.distance.shape[1]
@@ -124,8 +129,10 @@ def _geodesic_field(
     seen = total[..., :C].sum(1) > 0
     label = total[..., :C].argmax(1)  # (B, C), w
     distance = term.distance[:, None]  # (B, 1, C, C): from the point's cell to the other
-    # (B, L, 1, C), for a point labelled v. Not a product with one-hot labels: 0 times an infinite bound is NaN.
-    shortest, longest = term.shortest[:, label].transpose(0, 1)[:, :, None], term.longest[:, label].transpose(0, 1)[:, :, None]
+    # (B, L, 1, C), for a point labelled v. No product with one-hot labels: 0 times an infinite bound is NaN.
+    shortest, longest = (
+        bound[:, label].transpose(0, 1)[:, :, None] for bound in (term.shortest, term.longest)
+    )
     weight = strength / term.most.clamp_min(1 / C)[label] * seen  # alpha = beta of (3.12)
     outside = (distance < shortest) | (distance > longest)
     # Cells on another piece of the cloud say nothing: the way between them was not seen.

@@ -1,4 +1,4 @@
-"""Likelihoods of the body parts from appearance: each adds log-potentials to the labels of the points (T. 3.9 to 3.11).
+"""What images say of the points' body parts: each term adds log-potentials (T. 3.9 to 3.11).
 
 This is where a learned part likelihood plugs in: subclass `PartLikelihood`. Pixels (u, v), metres.
 """
@@ -28,8 +28,8 @@ class Evidence:
 class PartLikelihood(nn.Module, ABC):
     """log p(appearance | part) of each point, up to a constant per point.
 
-    It is not shown the pose, so it cannot depend on it: it shapes the labels (VE-step) and leaves the joint update
-    (M-step) and the bound's guarantee alone.
+    It is not shown the pose, so it cannot depend on it: it shapes the labels (VE-step) and leaves the joint
+    update (M-step) and the bound's guarantee alone.
     """
 
     def __init__(self, segment_names: Sequence[str]):
@@ -44,9 +44,9 @@ class PartLikelihood(nn.Module, ABC):
 @dataclass(frozen=True)
 class AppearanceConfig:
     face: float = 1.0  # c of (3.9): log-odds that a face pixel's point is the head's; 0 switches the term off
-    torso: float = 1.0  # log kappa of (3.10); 0 switches the term off
+    torso: float = 1.0  # power of (3.10), whose kappa is e; 0 switches the term off
     torso_aspect: float = 0.6  # the torso's ellipse in the image: width to height
-    torso_length: float = 0.9  # its half height as a share of the way from the face to the silhouette's centre
+    torso_length: float = 0.9  # its half height in ways from the face to the silhouette's centre
 
     def __post_init__(self) -> None:
         for name in ("torso_aspect", "torso_length"):
@@ -72,8 +72,8 @@ class FaceLikelihood(PartLikelihood):
 class TorsoLikelihood(PartLikelihood):
     """phi(torso) = kappa exp(-d(x)) where d(x) <= 1, else 1 (3.10, 3.11); d is algebraic, 0 on the ellipse.
 
-    The ellipse lies half way between the face and the silhouette's centre, along the line that joins them. Frames
-    without a face get nothing.
+    The ellipse lies half way between the face and the silhouette's centre, along the line that joins them.
+    Frames without a face get nothing.
     """
 
     def __init__(self, segment_names: Sequence[str], config: AppearanceConfig = AppearanceConfig()):
@@ -93,7 +93,7 @@ class TorsoLikelihood(PartLikelihood):
         distance = (down / half) ** 2 + (side / (half * self.config.torso_aspect)) ** 2 - 1
         inside = (distance <= 1) & evidence.faces.found[:, None] & cloud.mask
         potential = cloud.points.new_zeros(*cloud.mask.shape, len(self.segment_names))
-        # kappa = e^torso; at torso = 1 this is the thesis's e exp(-d). Outside the ellipse's d = 1 nothing is said.
+        # log(kappa exp(-d)) with kappa = e is 1 - d, which falls to 0 where d = 1.
         potential[..., self.torso] = torch.where(inside, self.config.torso * (1 - distance), 0.0)
         return potential
 
