@@ -12,10 +12,19 @@ PACKAGE = Path(__file__).resolve().parents[1] / "torchpose"
 # may import one another, also those that the design names and that are still to come. A new file takes its
 # place here first.
 ROOMS: dict[str, tuple[str, ...]] = {
-    "the ground": ("atomic", "geometry", "least_squares"),
-    "vision": ("camera", "windows", "photometry", "stereo", "background", "points", "faces"),
+    "the ground": ("atomic", "settings", "geometry", "least_squares"),
+    "vision": (
+        "camera",
+        "windows",
+        "photometry",
+        "disparity_space",
+        "stereo",
+        "background",
+        "points",
+        "faces",
+    ),
     "body": ("skeleton", "model", "ellipsoid", "superquadric", "angle"),
-    "registration": ("likelihood", "labelling", "geodesic", "fitting", "silhouette", "vem", "start"),
+    "registration": ("likelihood", "labelling", "geodesic", "fitting", "silhouette", "vem", "size", "start"),
     "tracking": ("kalman", "meanshift", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
@@ -23,7 +32,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "synthesis": ("motion", "room", "render", "database"),
     "learning": ("part_network", "training"),
-    "the desk": ("calibration", "recording", "export", "figures", "pipeline", "settings", "cli"),
+    "the desk": ("calibration", "recording", "export", "figures", "pipeline", "cli"),
 }
 ORDER = [
     f"torchpose.{file}" if room.startswith("the ") else f"torchpose.{room}.{file}"
@@ -40,7 +49,6 @@ FORBIDDEN = {
 NOT_AT_TOP = {"matplotlib", "pytorch_kinematics", "rerun", "ray", "tensorboard"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
-MODULES = [path for path in FILES if path.name != "__init__.py"]
 
 
 def module_name(path: Path) -> str:
