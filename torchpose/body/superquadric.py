@@ -399,9 +399,7 @@ class DisplayModel(nn.Module):
         self._constant("segments", torch.tensor(segments))
         self._constant("materials", torch.tensor([part.cloth for part in parts]))
         self._constant("cuts", torch.tensor([part.cut(person) for part in parts]))
-        self._constant(
-            "frames", torch.stack([_frame(torch.tensor(part.axis)) for part in parts])
-        )
+        self._constant("frames", torch.stack([_frame(torch.tensor(part.axis)) for part in parts]))
         self._constant("offsets", torch.tensor([part.start for part in parts]) * lengths[:, None])
         head = torch.tensor([size["head_girth"], size["neck"], size["head_girth"]])
         self._constant(
