@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.cluster import KMeans
 from torch.testing import assert_close
@@ -77,6 +77,7 @@ def test_more_centres_than_different_points_ends():
     assert fitted.inertia == 0
 
 
+@settings(max_examples=25)
 @given(st.integers(1, 8), st.integers(0, 10_000))
 def test_more_rounds_never_raise_the_inertia(size, seed):
     generator = torch.Generator().manual_seed(seed)
@@ -117,31 +118,49 @@ def test_lbg_reaches_any_size_and_is_as_good_as_the_best_of_random_starts(size):
 
 @pytest.mark.parametrize("start", list(CodebookStart))
 def test_the_codebook_standardises_and_passes_lost_frames_by(start):
+    """At `standardization` 1 the features' units do not matter."""
     scale = torch.tensor([1.0, 1000.0, 1.0], dtype=torch.float64)
     points = torch.cat([blobs(4, 2) * scale[:2], torch.full((160, 1), 7.0, dtype=torch.float64)], dim=1)
     with_gaps = torch.cat([points, torch.tensor([[torch.nan, 0.0, 7.0]], dtype=torch.float64)])
-    codebook = Codebook(CodebookConfig(size=4, start=start))
+    codebook = Codebook(CodebookConfig(size=4, start=start, standardization=1.0))
     fitted = codebook.fit(with_gaps)
     assert_close(codebook.mean, points.mean(0))
     assert_close(codebook.scale[:2], points[:, :2].std(0, unbiased=False))
-    assert codebook.scale[2] == 1  # a constant feature is not blown up
+    assert codebook.scale[2] > 1  # a constant feature is not blown up
     symbols = codebook(with_gaps)
     assert symbols[-1] == -1
     assert torch.equal(symbols[:-1], fitted.symbols)
     assert torch.equal(symbols[:-1].view(4, 40), symbols[:-1:40, None].expand(4, 40))  # one symbol a blob
     assert len(set(symbols.tolist())) == 5
-    other_unit = Codebook(CodebookConfig(size=4, start=start))
+    other_unit = Codebook(CodebookConfig(size=4, start=start, standardization=1.0))
     other_unit.fit(with_gaps / scale)
     assert torch.equal(other_unit(with_gaps / scale), symbols)
 
 
 def test_without_standardising_large_features_decide():
     points = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 100.0], [1.0, 100.0]])
-    codebook = Codebook(CodebookConfig(size=2, standardize=False))
+    codebook = Codebook(CodebookConfig(size=2, standardization=0.0))
     codebook.fit(points)
     symbols = codebook(points).tolist()
     assert symbols[0] == symbols[1] != symbols[2] == symbols[3]
-    assert_close(codebook.scale, torch.ones(2))
+    assert codebook.scale[0] == codebook.scale[1]
+
+
+def test_half_way_the_ratio_of_the_scales_is_the_root_of_the_deviations_ratio():
+    points = torch.randn(100, 2, dtype=torch.float64) * torch.tensor([1.0, 9.0])
+    codebook = Codebook(CodebookConfig(size=2))
+    codebook.fit(points)
+    deviation = points.std(0, unbiased=False)
+    assert_close(codebook.scale[1] / codebook.scale[0], (deviation[1] / deviation[0]).sqrt())
+    # In all, the scaled points vary about as much as standardised ones, so the tolerance means the same.
+    assert 0.3 < ((points / codebook.scale).var(0).mean()) < 3
+
+
+def test_features_that_never_change_make_one_symbol():
+    codebook = Codebook(CodebookConfig(size=2))
+    fitted = codebook.fit(torch.full((5, 3), 0.1))
+    assert fitted.inertia == 0
+    assert (codebook(torch.full((4, 3), 0.1)) == codebook(torch.full((3,), 0.1))).all()
 
 
 def test_batches_are_encoded_one_by_one_and_seeds_repeat():
@@ -166,5 +185,7 @@ def test_bad_input_is_named():
         Codebook()(torch.randn(5, 2))
     with pytest.raises(ValueError, match="must be at least 1, got 0, 3 and 100"):
         CodebookConfig(size=0)
+    with pytest.raises(ValueError, match="standardization of the codebook must be from 0 to 1, got 2"):
+        CodebookConfig(standardization=2.0)
     with pytest.raises(ValueError, match="tolerance of the codebook must not be negative"):
         CodebookConfig(tolerance=-1.0)

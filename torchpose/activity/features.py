@@ -39,13 +39,13 @@ class BodyFrame(Enum):
 class FeatureConfig:
     """Which feature and how; each kind reads its own part."""
 
-    kind: FeatureKind = FeatureKind.angles
+    kind: FeatureKind = FeatureKind.angles  # angles, directions, pca, ica or skeleton
     velocity_step: int = 0  # append x(t + step) - x(t - step); 0 appends nothing
     num_components: int = 150  # pca, ica: m of the thesis
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)  # pca, ica
-    ica_iterations: int = 200
-    ica_tolerance: float = 1e-4
-    frame: BodyFrame = BodyFrame.heading  # skeleton
+    ica_iterations: int = 200  # ica: at most, of FastICA
+    ica_tolerance: float = 1e-4  # ica: stop when no component turns by more, 1 - |cosine|
+    frame: BodyFrame = BodyFrame.heading  # skeleton: heading or trunk
 
     def __post_init__(self) -> None:
         if self.velocity_step < 0:

@@ -44,13 +44,13 @@ class Status(IntEnum):
 class HMMConfig:
     """Structure, smoothing and training of the models."""
 
-    states: int = 4
-    topology: Topology = Topology.left_to_right
+    states: int = 4  # of each activity's model
+    topology: Topology = Topology.left_to_right  # left_to_right or ergodic
     emission_prior: float = (
         1.1  # Dirichlet concentration: each symbol's pseudo-count plus 1; 1 smooths nothing
     )
     transition_prior: float = 1.1  # the same for each transition that the topology allows
-    iterations: int = 50
+    iterations: int = 50  # at most, of Baum-Welch
     tolerance: float = 1e-5  # stop when the objective gains less, nats per observed frame
     start_noise: float = 0.1  # relative random disturbance of the start's emission counts
 

@@ -5,6 +5,7 @@ sequences compare.
 """
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -13,17 +14,16 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, Int
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
-from yaml import YAMLError
 
 from torchpose.activity.codebook import Codebook, CodebookConfig
 from torchpose.activity.dataset import Clip
 from torchpose.activity.features import FeatureConfig, build_feature
 from torchpose.activity.hmm import MISSING, BaumWelch, DiscreteHMM, HMMConfig, Status
 from torchpose.atomic import replacing
+from torchpose.settings import compose_config
 
 NO_ACTIVITY = -1
 _SETTINGS, _WEIGHTS = "recognizer.yaml", "recognizer.safetensors"
@@ -47,7 +47,7 @@ class RecognizerConfig:
     hmm: HMMConfig = field(default_factory=HMMConfig)
     # Reject a sequence whose best model beats the background by less, nats per frame; null never rejects.
     rejection_threshold: float | None = None
-    seed: int = 0
+    seed: int = 0  # of the starts of ICA, codebook and models
 
 
 @dataclass(frozen=True)
@@ -195,17 +195,13 @@ class Recognizer(nn.Module):
     def save(self, folder: Path | str) -> None:
         """Write `recognizer.yaml` (settings) and `recognizer.safetensors`, each whole or not at all."""
         folder = Path(folder)
+        settings = OmegaConf.to_yaml(OmegaConf.structured(self.config))
+        metadata = {"activities": json.dumps(self.activities), "settings_sha256": _digest(settings)}
         weights = {name: value.cpu().contiguous() for name, value in self.state_dict().items()}
         with replacing(folder / _WEIGHTS) as partial:
-            save_file(weights, partial)
-            digest = hashlib.sha256(partial.read_bytes()).hexdigest()
-        settings = {
-            "activities": list(self.activities),
-            "weights_sha256": digest,
-            "config": OmegaConf.structured(self.config),
-        }
+            save_file(weights, partial, metadata)
         with replacing(folder / _SETTINGS) as partial:
-            partial.write_text(OmegaConf.to_yaml(OmegaConf.create(settings)))
+            partial.write_text(settings, encoding="utf-8")
 
     @classmethod
     def load(cls, folder: Path | str) -> "Recognizer":
@@ -222,19 +218,18 @@ class Recognizer(nn.Module):
                     f"no recogniser in {folder}: {name} is missing; train one with train.py"
                 )
         try:
-            settings = OmegaConf.load(folder / _SETTINGS)
-            merged = OmegaConf.merge(OmegaConf.structured(RecognizerConfig), settings.config)
-            config = OmegaConf.to_object(merged)
-            activities, digest = tuple(settings.activities), settings.weights_sha256
-            weights = load_file(folder / _WEIGHTS)
-        except (OmegaConfBaseException, YAMLError, SafetensorError, AttributeError, TypeError) as error:
-            raise ValueError(f"the recogniser in {folder} cannot be read: {error}; train it again") from error
-        if hashlib.sha256((folder / _WEIGHTS).read_bytes()).hexdigest() != digest:
+            with safe_open(folder / _WEIGHTS, "pt") as file:
+                metadata = file.metadata() or {}
+                weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        except SafetensorError as error:
+            raise ValueError(f"{folder / _WEIGHTS} cannot be read: {error}; train it again") from error
+        settings = (folder / _SETTINGS).read_text(encoding="utf-8", errors="replace")
+        if metadata.get("settings_sha256") != _digest(settings):
             raise ValueError(
-                f"{_WEIGHTS} in {folder} is not the one that {_SETTINGS} was saved with; train it again"
+                f"{_SETTINGS} and {_WEIGHTS} in {folder} must be of one training; train it again"
             )
-        assert isinstance(config, RecognizerConfig)
-        recognizer = cls(config, activities)
+        config = compose_config(RecognizerConfig, folder, Path(_SETTINGS).stem)
+        recognizer = cls(config, json.loads(metadata["activities"]))
         # What is learned has no shape before it is learned.
         for name, value in weights.items():
             owner, _, buffer = name.rpartition(".")
@@ -249,6 +244,10 @@ class Recognizer(nn.Module):
         symbols = self.codebook(torch.cat(features)).split(lengths)
         padded = nn.utils.rnn.pad_sequence(list(symbols), batch_first=True, padding_value=MISSING)
         return padded, torch.tensor(lengths, device=padded.device)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", errors="replace")).hexdigest()
 
 
 def _labels(clips: Sequence[Clip], activities: tuple[str, ...]) -> Int[Tensor, " sequences"]:

@@ -24,7 +24,7 @@ class SilhouetteConfig:
 
     height: int = 32  # px
     width: int = 24  # px
-    crop: Crop = Crop.person
+    crop: Crop = Crop.person  # person or image
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 1:
@@ -105,7 +105,9 @@ def pca(images: Float[Tensor, "images pixels"], num_components: int) -> PCA:
     mean = images.mean(0)
     centered = images - mean
     by_gram = len(images) < images.shape[1]
-    values, vectors = torch.linalg.eigh(centered @ centered.T if by_gram else centered.T @ centered)
+    # In double precision: pixels that never change make many eigenvalues 0, where LAPACK's single may fail.
+    squares = (centered @ centered.T if by_gram else centered.T @ centered).double()
+    values, vectors = (part.to(images.dtype) for part in torch.linalg.eigh(squares))
     # Rounding leaves eigenvalues of about eps times the greatest where the true ones are 0.
     floor = values[-1] * torch.finfo(images.dtype).eps * max(images.shape)
     rank = min(int((values > floor).sum()), len(images) - 1)
@@ -144,7 +146,8 @@ def fast_ica(
     """
     samples = signals.shape[1]
     centered = signals - signals.mean(1, keepdim=True)
-    values, vectors = torch.linalg.eigh(centered @ centered.T / samples)
+    covariance = (centered @ centered.T / samples).double()
+    values, vectors = (part.to(signals.dtype) for part in torch.linalg.eigh(covariance))
     kept = values > values[-1] * torch.finfo(signals.dtype).eps * max(signals.shape)
     whitening = vectors[:, kept].T / values[kept].sqrt()[:, None]
     white = whitening @ centered

@@ -1,0 +1,399 @@
+"""Features against scikit-learn, SciPy's rotations, and what they must not depend on."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from sklearn.decomposition import PCA, FastICA
+from torch.testing import assert_close
+
+from torchpose.activity.dataset import Clip
+from torchpose.activity.features import (
+    BodyFrame,
+    FeatureConfig,
+    FeatureKind,
+    ICAFeature,
+    JointAngleFeature,
+    LimbDirectionFeature,
+    PCAFeature,
+    SkeletonFeature,
+    VelocityFeature,
+    build_feature,
+)
+from torchpose.activity.skeleton import bone_directions, joint_index, trunk_frame
+from torchpose.activity.subspace import Crop, SilhouetteConfig, fast_ica, pca, resize_silhouettes
+
+WHO = ("walk", "1", "1")
+JOINTS = (
+    *("pelvis", "neck", "head", "shoulder_left", "shoulder_right", "elbow_left", "elbow_right", "wrist_left"),
+    *("wrist_right", "hip_left", "hip_right", "knee_left", "knee_right", "ankle_left", "ankle_right"),
+)
+
+
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+def blocks(frames=40, height=24, width=32):
+    """Rectangles of many shapes and places, as silhouettes."""
+    masks = torch.zeros(frames, height, width, dtype=torch.bool)
+    for mask in masks:
+        top, left = (int(torch.randint(size // 2, ())) for size in (height, width))
+        high, wide = (int(torch.randint(3, size // 2, ())) for size in (height, width))
+        mask[top : top + high, left : left + wide] = True
+    return masks
+
+
+# --- silhouettes ---
+
+
+def test_the_whole_image_shrinks_by_block_means():
+    image = torch.rand(3, 12, 20, dtype=torch.float64)
+    small = resize_silhouettes(image, SilhouetteConfig(4, 5, Crop.image))
+    assert_close(small, image.reshape(3, 4, 3, 5, 4).mean((2, 4)))
+
+
+def test_the_same_size_is_the_same_image():
+    masks = blocks()
+    same = resize_silhouettes(masks, SilhouetteConfig(24, 32, Crop.image))
+    assert_close(same, masks.float())
+
+
+def test_an_uneven_shrink_keeps_the_area():
+    masks = blocks(height=25, width=31)
+    small = resize_silhouettes(masks, SilhouetteConfig(7, 9, Crop.image), torch.float64)
+    assert_close(small.mean((1, 2)), masks.double().mean((1, 2)))
+
+
+def test_a_person_crop_keeps_proportions_and_forgets_place_and_size():
+    config = SilhouetteConfig(8, 6)
+    base = torch.zeros(1, 60, 80)
+    base[0, 10:26, 20:26] = 1  # 16 x 6: the box becomes 16 x 12, a target pixel is 2 x 2
+    expected = torch.zeros(8, 6)
+    expected[:, 1:2], expected[:, 2:4], expected[:, 4:5] = 0.5, 1, 0.5
+    assert_close(resize_silhouettes(base, config)[0], expected)
+    moved = base.roll((7, 30), dims=(1, 2))
+    doubled = base.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    assert_close(resize_silhouettes(moved, config)[0], expected)
+    assert_close(resize_silhouettes(doubled, config)[0], expected)
+    wide = torch.zeros(1, 60, 80)
+    wide[0, 30:34, 10:70] = 1  # arms out: not stretched to the full height
+    assert_close(resize_silhouettes(wide, config).sum(), torch.tensor(4 * 60 / 10**2))
+
+
+def test_a_crop_beyond_the_image_is_background():
+    mask = torch.zeros(1, 10, 10, dtype=torch.bool)
+    mask[:, :, :2] = True  # 10 x 2 at the left edge; the box reaches out to the left
+    small = resize_silhouettes(mask, SilhouetteConfig(5, 5))
+    assert_close(small, torch.tensor([0.0, 0, 1, 0, 0]).expand(1, 5, 5))
+
+
+def test_frames_without_a_silhouette_are_lost():
+    masks = blocks(4)
+    masks[1] = False
+    images = masks.float()
+    images[2, 0, 0] = torch.nan
+    for crop in Crop:
+        small = resize_silhouettes(images, SilhouetteConfig(crop=crop))
+        assert small.isnan().flatten(1).all(1).tolist() == [False, True, True, False]
+        assert not small[[0, 3]].isnan().any()
+
+
+def test_silhouettes_shrink_together_as_one_by_one():
+    masks = blocks(6)
+    together = resize_silhouettes(masks)
+    assert_close(together, torch.cat([resize_silhouettes(mask[None]) for mask in masks]))
+
+
+# --- subspaces ---
+
+
+@pytest.mark.parametrize(("images", "pixels"), [(30, 12), (12, 30)], ids=["covariance", "Gram"])
+def test_pca_matches_scikit_learn(images, pixels):
+    data = torch.randn(images, pixels, dtype=torch.float64) * torch.linspace(
+        1, 3, pixels, dtype=torch.float64
+    )
+    ours, oracle = pca(data, 6), PCA(6).fit(data.numpy())
+    signs = torch.from_numpy(np.sign(np.sum(oracle.components_ * ours.components.numpy(), axis=1)))
+    assert_close(ours.components, torch.from_numpy(oracle.components_) * signs[:, None], rtol=0, atol=1e-9)
+    assert_close(ours.mean, torch.from_numpy(oracle.mean_))
+    # scikit-learn divides by n - 1
+    assert_close(ours.variance * images / (images - 1), torch.from_numpy(oracle.explained_variance_))
+    greatest = ours.components.gather(1, ours.components.abs().argmax(1, keepdim=True))
+    assert (greatest > 0).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("images", "pixels"), [(50, 20), (15, 20)], ids=["covariance", "Gram"])
+def test_pca_gives_no_more_components_than_the_images_span(images, pixels, dtype):
+    data = torch.randn(images, 4, dtype=dtype) @ torch.randn(4, pixels, dtype=dtype)
+    fitted = pca(data, 150)
+    assert fitted.components.shape == (4, pixels)
+    assert_close(fitted.components @ fitted.components.T, torch.eye(4, dtype=dtype), rtol=0, atol=1e-4)
+    centered = data - fitted.mean
+    assert_close(centered @ fitted.components.T @ fitted.components, centered, rtol=1e-3, atol=1e-3)
+
+
+def test_pca_of_silhouettes_that_leave_most_pixels_alone():
+    """LAPACK's single precision did not converge on such a covariance: most of its eigenvalues are 0."""
+    masks = torch.zeros(900, 32, 24)
+    masks[:, 8:24, 6:18] = blocks(900, 16, 12).float()
+    components = pca(masks.flatten(1), 250).components
+    assert len(components) <= 16 * 12
+    assert_close(components @ components.T, torch.eye(len(components)), rtol=0, atol=1e-3)
+
+
+def test_pca_needs_images_that_differ():
+    with pytest.raises(ValueError, match="at least two images that differ, got 5"):
+        pca(torch.ones(5, 9), 3)
+    with pytest.raises(ValueError, match="at least two images that differ, got 1"):
+        pca(torch.rand(1, 9), 3)
+
+
+def mixture(samples=4000):
+    """Four independent sources, none of them Gaussian, and a known mixing."""
+    time = torch.linspace(0, 80, samples, dtype=torch.float64)
+    sources = torch.stack(
+        [
+            time.sin(),
+            (3 * time).sin().sign(),
+            (time % 1.7) - 0.85,
+            torch.rand(samples, dtype=torch.float64, generator=generator()).sub(0.5).pow(3),
+        ]
+    )
+    sources = (sources - sources.mean(1, keepdim=True)) / sources.std(1, keepdim=True, unbiased=False)
+    mixing = torch.randn(4, 4, dtype=torch.float64, generator=generator())
+    return mixing, mixing @ sources + 5
+
+
+def test_fast_ica_finds_the_sources():
+    mixing, signals = mixture()
+    fitted = fast_ica(signals, torch.randn(4, 4, dtype=torch.float64, generator=generator()))
+    assert fitted.converged
+    # Unmixing and mixing undo each other up to order and sign.
+    product = (fitted.unmixing @ mixing).abs()
+    assert sorted(product.argmax(1).tolist()) == [0, 1, 2, 3]
+    assert_close(product.amax(1), torch.ones(4).double(), rtol=0, atol=0.01)
+    assert (product.sum(1) - product.amax(1)).max() < 0.15
+    found = fitted.unmixing @ (signals - signals.mean(1, keepdim=True))
+    assert_close(found @ found.T / signals.shape[1], torch.eye(4).double())  # unit variance, uncorrelated
+
+
+def test_fast_ica_matches_scikit_learn():
+    _, signals = mixture()
+    start = torch.randn(4, 4, dtype=torch.float64, generator=generator())
+    ours = fast_ica(signals, start, iterations=500, tolerance=1e-12)
+    oracle = FastICA(4, whiten="unit-variance", fun="logcosh", tol=1e-12, max_iter=500, w_init=start.numpy())
+    oracle.fit(signals.T.numpy())
+    # The whitening's basis differs in order and sign, so the starts and the rows found do.
+    product = ours.unmixing @ torch.from_numpy(np.linalg.pinv(oracle.components_))
+    assert sorted(product.abs().argmax(1).tolist()) == [0, 1, 2, 3]
+    assert_close(product.abs(), (product.abs() > 0.5).double(), rtol=0, atol=1e-5)
+
+
+def test_fast_ica_drops_what_the_other_signals_determine_and_reports_no_convergence():
+    _, signals = mixture()
+    doubled = torch.cat([signals, signals[:2].sum(0, keepdim=True)])
+    fitted = fast_ica(doubled, torch.eye(5, dtype=torch.float64))
+    assert fitted.unmixing.shape == (4, 5)
+    assert fitted.converged
+    hasty = fast_ica(signals, torch.randn(4, 4, dtype=torch.float64, generator=generator()), iterations=1)
+    assert not hasty.converged
+    assert hasty.iterations == 1
+
+
+def silhouette_clips():
+    return [Clip(*WHO, silhouettes=blocks(30)) for _ in range(3)]
+
+
+def subspace_config(kind, components):
+    return FeatureConfig(kind, num_components=components, silhouette=SilhouetteConfig(8, 8, Crop.image))
+
+
+def test_pca_feature_is_the_projection_of_scikit_learn():
+    clips = silhouette_clips()
+    feature = PCAFeature(subspace_config(FeatureKind.pca, 10))
+    feature.fit(clips, generator())
+    images = torch.cat(
+        [resize_silhouettes(c.silhouettes, feature.config.silhouette).flatten(1) for c in clips]
+    )
+    expected = torch.from_numpy(PCA(10).fit(images.double().numpy()).transform(images.double().numpy()))
+    found = torch.cat([feature(clip) for clip in clips])
+    assert_close(found.abs().double(), expected.abs(), rtol=0, atol=1e-3)
+
+
+def test_ica_feature_spans_what_pca_spans():
+    """(4.8): F E_ICA = X E_PCA^T W^-1 W E_PCA, so both rebuild the same silhouettes."""
+    clips = silhouette_clips()
+    by_pca, by_ica = (build_feature(subspace_config(kind, 10)) for kind in (FeatureKind.pca, FeatureKind.ica))
+    for feature in (by_pca, by_ica):
+        feature.fit(clips, generator())
+    rebuilt = [feature(clips[0]) @ torch.linalg.pinv(feature.projection) for feature in (by_pca, by_ica)]
+    assert_close(rebuilt[1], rebuilt[0], rtol=0, atol=1e-3)
+    assert (by_ica(clips[0]).abs() - by_pca(clips[0]).abs()).abs().max() > 0.1
+    # E_ICA = projection^+ has rows of unit variance over the pixels, uncorrelated once their means are off.
+    images = torch.linalg.pinv(by_ica.projection)
+    images = images - images.mean(1, keepdim=True)
+    assert_close(images @ images.T / images.shape[1], torch.eye(10), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [FeatureKind.pca, FeatureKind.ica])
+def test_silhouette_features_clip_m_pass_lost_frames_and_repeat(kind):
+    clips = [Clip(*WHO, silhouettes=blocks(5)) for _ in range(2)]
+    clips[0].silhouettes[2] = False
+    feature, again = (build_feature(subspace_config(kind, 150)) for _ in range(2))
+    for one in (feature, again):
+        one.fit(clips, generator())
+    values = feature(clips[0])
+    assert values.shape[1] <= 8  # nine silhouettes span eight directions
+    assert values.isnan().all(1).tolist() == [False, False, True, False, False]
+    assert torch.equal(values.nan_to_num(), again(clips[0]).nan_to_num())
+
+
+@pytest.mark.parametrize("feature", [PCAFeature(), ICAFeature()], ids=["pca", "ica"])
+def test_silhouette_features_name_what_is_missing(feature):
+    with pytest.raises(ValueError, match="made for images of 0 pixels, got 768; call fit first"):
+        feature(Clip(*WHO, silhouettes=blocks(2)))
+    with pytest.raises(ValueError, match="need a frame with foreground, got none"):
+        feature.fit([Clip(*WHO, silhouettes=torch.zeros(2, 9, 9))], generator())
+    with pytest.raises(ValueError, match="needs 'silhouettes' in every clip"):
+        feature.fit([Clip(*WHO, pose=torch.zeros(2, 24))], generator())
+
+
+# --- angles and directions ---
+
+
+def test_joint_angles_leave_out_place_and_heading():
+    pose = torch.randn(5, 24)
+    pose[3] = torch.nan
+    values = JointAngleFeature()(Clip(*WHO, pose=pose))
+    assert torch.equal(values.nan_to_num(), pose[:, 4:].nan_to_num())
+    elsewhere = pose.clone()
+    elsewhere[:, :4] += 2
+    assert torch.equal(JointAngleFeature()(Clip(*WHO, pose=elsewhere)).nan_to_num(), values.nan_to_num())
+
+
+def test_limb_directions_and_lean():
+    pose = torch.randn(6, 24, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(6, 9, 3, dtype=torch.float64), dim=2)
+    values = LimbDirectionFeature()(Clip(*WHO, pose=pose, directions=directions))
+    assert_close(values[:, :27], directions.flatten(1))
+    # R = Ry(yaw) Rx(pitch) Rz(roll); the camera's down in the torso's frame is R^T e_y.
+    rotation = Rotation.from_euler("YXZ", pose[:, 3:6].numpy()).as_matrix()
+    assert_close(values[:, 27:], torch.from_numpy(rotation[:, 1, :].copy()))
+    directions[2, 4, 1] = torch.nan
+    lost = LimbDirectionFeature()(Clip(*WHO, pose=pose, directions=directions))
+    assert lost.isnan().all(1).tolist() == [False, False, True, False, False, False]
+    assert not lost[[0, 1, 3, 4, 5]].isnan().any()
+
+
+def standing():
+    """A person who stands upright in the camera's frame (y down), facing it, arms hanging; m."""
+    points = {
+        "pelvis": (0, 0, 3),
+        "neck": (0, -0.5, 3),
+        "head": (0, -0.75, 3),
+        "shoulder_left": (0.2, -0.5, 3),
+        "elbow_left": (0.2, -0.2, 3),
+        "wrist_left": (0.2, 0.05, 3),
+        "hip_left": (0.1, 0, 3),
+        "knee_left": (0.1, 0.45, 3),
+        "ankle_left": (0.1, 0.9, 3),
+    }
+    for name, (x, y, z) in list(points.items()):
+        if name.endswith("_left"):
+            points[name.replace("left", "right")] = (-x, y, z)
+    return torch.tensor([points[name] for name in JOINTS], dtype=torch.float64)
+
+
+def test_bones_of_a_person_who_stands_and_points():
+    joints = standing()[None].repeat(2, 1, 1)
+    joints[1, JOINTS.index("wrist_left")] = joints[1, JOINTS.index("elbow_left")] + torch.tensor(
+        [0, 0, -0.25]
+    )
+    found = bone_directions(joints, JOINTS)
+    down, up, forward = torch.tensor([[0.0, 1, 0], [0, -1, 0], [0, 0, -1]], dtype=torch.float64)
+    assert_close(found[0], torch.stack([up, *[down] * 8]))
+    assert_close(found[1], torch.stack([up, down, forward, *[down] * 6]))
+    assert_close(bone_directions(joints, JOINTS, upright=True)[:, 1:], found)
+    assert_close(bone_directions(joints, JOINTS, upright=True)[:, 0], down.expand(2, 3))
+
+
+@pytest.mark.parametrize("frame", list(BodyFrame))
+def test_bones_do_not_depend_on_place_heading_size_and_where_up_is(frame):
+    joints = standing() + 0.1 * torch.randn(7, 15, 3, dtype=torch.float64)
+    turn = torch.from_numpy(Rotation.from_euler("y", 2.1).as_matrix())
+    feature = SkeletonFeature(frame)
+    expected = feature(Clip(*WHO, joints=joints, joint_names=JOINTS))
+    for other in (1.7 * joints @ turn.T + 5, joints * torch.tensor([-1.0, -1.0, 1.0])):
+        assert_close(feature(Clip(*WHO, joints=other, joint_names=JOINTS)), expected)
+    tipped = joints @ torch.from_numpy(Rotation.from_euler("x", 0.5).as_matrix()).T
+    same = torch.allclose(feature(Clip(*WHO, joints=tipped, joint_names=JOINTS)), expected)
+    assert same == (frame is BodyFrame.trunk)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_the_body_frame_is_a_rotation(upright):
+    joints = standing() + 0.1 * torch.randn(7, 15, 3, dtype=torch.float64)
+    frame = trunk_frame(joints, joint_index(JOINTS), upright)
+    assert_close(frame.transpose(1, 2) @ frame, torch.eye(3).double().expand(7, 3, 3))
+    assert_close(torch.linalg.det(frame), torch.ones(7).double())
+
+
+def test_lost_skeletons_are_lost_features():
+    joints = standing()[None].repeat(3, 1, 1)
+    joints[1] = torch.nan
+    for frame in BodyFrame:
+        values = SkeletonFeature(frame)(Clip(*WHO, joints=joints, joint_names=JOINTS))
+        assert values.isnan().all(1).tolist() == [False, True, False]
+
+
+def test_joint_names_of_other_recorders():
+    kinect = ["hip_center", "spine", "shoulder_center", "head", "left_shoulder", "right_shoulder", "left_hip"]
+    kinect += ["right_hip", "left_hand"]
+    assert joint_index(kinect) == {
+        "pelvis": 0,
+        "neck": 2,
+        "head": 3,
+        "shoulder_left": 4,
+        "shoulder_right": 5,
+        "hip_left": 6,
+        "hip_right": 7,
+    }
+    camel = ["LeftShoulder", "RightShoulder", "leftHip", "HipRight", "RElbow", "l_wrist"]
+    assert set(joint_index(camel)) == {
+        *("shoulder_left", "shoulder_right", "hip_left", "hip_right", "elbow_right", "wrist_left"),
+    }
+    with pytest.raises(ValueError, match="hip_right cannot be found in joint_names left_shoulder, "):
+        joint_index(["left_shoulder", "right_shoulder", "left_hip", "head"])
+
+
+def test_velocity_is_the_change_over_both_sides():
+    pose = torch.randn(6, 24)
+    feature = VelocityFeature(JointAngleFeature(), 2)
+    values = feature(Clip(*WHO, pose=pose))
+    still, change = values[:, :20], values[:, 20:]
+    assert torch.equal(still, pose[:, 4:])
+    assert_close(change[2:4], pose[4:, 4:] - pose[:2, 4:])
+    assert_close(change[0], pose[2, 4:] - pose[0, 4:])
+    assert_close(change[5], pose[5, 4:] - pose[3, 4:])
+    assert_close(feature(Clip(*WHO, pose=pose[:1]))[:, 20:], torch.zeros(1, 20))
+
+
+@pytest.mark.parametrize("kind", list(FeatureKind))
+def test_the_configuration_builds_every_kind(kind):
+    plain, moving = build_feature(FeatureConfig(kind)), build_feature(FeatureConfig(kind, velocity_step=3))
+    assert isinstance(moving, VelocityFeature)
+    assert type(moving.feature) is type(plain)
+    assert not isinstance(plain, VelocityFeature)
+
+
+def test_bad_settings_are_named():
+    with pytest.raises(ValueError, match="velocity_step must be a number of frames or 0 for none, got -1"):
+        FeatureConfig(velocity_step=-1)
+    with pytest.raises(ValueError, match="num_components and ica_iterations must be at least 1"):
+        FeatureConfig(num_components=0)
+    with pytest.raises(ValueError, match="silhouette size must be at least 1 x 1 px, got 0 x 24"):
+        SilhouetteConfig(height=0)
+    with pytest.raises(ValueError, match="step of a velocity must be at least 1 frame, got 0"):
+        VelocityFeature(JointAngleFeature(), 0)
