@@ -1,6 +1,7 @@
 """Rotations: the exponential map, its derivative and its inverse, minimal rotations and axis pairs.
 
-Rotation vectors are in radians; every function takes any number of leading batch axes, any device and any float dtype.
+Rotation vectors are in radians; every function takes any number of leading batch axes, any device and any
+float dtype.
 """
 
 import torch
@@ -25,7 +26,11 @@ def _sinc_terms(theta2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), safe.sin() / safe)
     half = (safe / 2).sin()
     b = torch.where(small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), 2 * half * half / safe2)
-    c = torch.where(small, 1 / 6 - theta2 / 120 * (1 - theta2 / 42 * (1 - theta2 / 72)), (safe - safe.sin()) / (safe2 * safe))
+    c = torch.where(
+        small,
+        1 / 6 - theta2 / 120 * (1 - theta2 / 42 * (1 - theta2 / 72)),
+        (safe - safe.sin()) / (safe2 * safe),
+    )
     return a, b, c
 
 
@@ -50,19 +55,27 @@ def rotation_between(
 ) -> Float[Tensor, "*batch 3"]:
     """Rotation vector of the smallest rotation that turns the unit vector `start` into `end`.
 
-    Opposite vectors leave the axis undefined; an axis across `start` is then taken.
+    Opposite vectors leave the axis undefined; an axis across `start` is then taken. Differentiable elsewhere,
+    also where the two are equal.
     """
     axis = torch.linalg.cross(start, end)
-    sine = axis.norm(dim=-1, keepdim=True)
-    angle = torch.atan2(sine, (start * end).sum(-1, keepdim=True))
+    # Near opposite vectors the axis is as short as its rounding error, whose part along `start` would spoil
+    # the turn.
+    axis = axis - (axis * start).sum(-1, keepdim=True) * start
+    square = (axis * axis).sum(-1, keepdim=True)
+    cosine = (start * end).sum(-1, keepdim=True)
+    parallel = square < torch.finfo(start.dtype).eps ** 2
+    sine = torch.where(parallel, 1.0, square).sqrt()  # 1: the unused branch is differentiated too
+    vector = axis * torch.where(parallel, 1.0, torch.atan2(sine, cosine) / sine)
     # The unit vector furthest from `start` is never parallel to it.
     least = torch.nn.functional.one_hot(start.abs().argmin(-1), 3).to(start)
     across = torch.nn.functional.normalize(torch.linalg.cross(start, least), dim=-1)
-    tiny = torch.finfo(start.dtype).eps
-    return torch.where(sine > tiny, axis / sine.clamp_min(tiny), across) * angle
+    return torch.where(parallel & (cosine < 0), across * torch.pi, vector)
 
 
-def angle_between(first: Float[Tensor, "*batch 3"], second: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+def angle_between(
+    first: Float[Tensor, "*batch 3"], second: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch"]:
     """Angle between two vectors of any length, rad in [0, pi]; exact near 0 and pi, where arccos is not."""
     cross = torch.linalg.cross(first, second)
     # A norm has no derivative at zero, where aligned vectors lie; the floor makes it 0 there.
@@ -73,14 +86,15 @@ def angle_between(first: Float[Tensor, "*batch 3"], second: Float[Tensor, "*batc
 def axis_pair_angles(
     axes: Float[Tensor, "*batch 2 3"], start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 2 2"]:
-    """Both pairs (t1, t2) with `exp(axis_1 t1) exp(axis_2 t2) start = end` (Paden and Kahan's second problem).
+    """Both pairs (t1, t2) with `exp(axis_1 t1) exp(axis_2 t2) start = end` (Paden-Kahan's second problem).
 
     The axes are unit vectors at a right angle to each other. Where `end` cannot be reached, the nearest
     direction that can is taken. Returns angles in radians, one solution per row of the second last axis.
     """
     first, second = axes.unbind(-2)
     third = torch.linalg.cross(first, second)
-    # In the frame (first, second, third): turning about `second` must bring start's part along `first` to end's.
+    # In the frame (first, second, third) the turn about `second` must bring start's part along `first` to
+    # end's.
     along = (first * end).sum(-1)
     level = (first * start).sum(-1)
     side = (third * start).sum(-1)

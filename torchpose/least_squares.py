@@ -46,9 +46,9 @@ class Solution:
 
     value: Float[Tensor, "batch unknowns"]
     loss: Float[Tensor, " batch"]  # half the sum of squares at `value`
-    normal: Float[Tensor, "batch unknowns unknowns"]  # J^T J at the last point that was linearised
+    normal: Float[Tensor, "batch unknowns unknowns"]  # J^T J at `value`, 0 where that is not finite
     status: Int[Tensor, " batch"]
-    steps: Int[Tensor, " batch"]
+    steps: Int[Tensor, " batch"]  # tried, whether kept or not
 
 
 def levenberg_marquardt(
@@ -56,9 +56,9 @@ def levenberg_marquardt(
 ) -> Solution:
     """Minimise |r(x)|^2 / 2 for each row of `start` on its own.
 
-    Each step solves (J^T J + lambda diag(J^T J)) d = -J^T r. A step that lowers the loss is kept and lambda falls
-    tenfold; otherwise x stays and lambda rises tenfold. So the loss never rises, and a row that is not finite, or has
-    converged, changes neither itself nor its neighbours.
+    Each step solves (J^T J + lambda diag(J^T J)) d = -J^T r. A step that lowers the loss is kept and lambda
+    falls tenfold; otherwise x stays and lambda rises tenfold. So the loss never rises, and a row that is not
+    finite, or has converged, changes neither itself nor its neighbours.
 
     Args:
         linearize: maps x (B, P) to residuals r (B, M) and their Jacobian (B, M, P).
@@ -79,14 +79,19 @@ def levenberg_marquardt(
         trial = torch.where(active[:, None], x + step, x)
         residual, jacobian = linearize(trial)
         trial_loss = _loss(residual)
-        better = active & (trial_loss < loss)  # False where the trial is not finite
+        new_normal, new_gradient = _normal_equations(residual, jacobian)
+        # False where the trial is not finite. A Jacobian that is not would leave no way on: its diagonal
+        # tells.
+        linear = new_normal.diagonal(dim1=1, dim2=2).isfinite().all(1)
+        better = active & (trial_loss < loss) & linear
         fall = loss - trial_loss
-        done = better & ((step.abs().amax(1) < config.step_tolerance) | (fall <= config.loss_tolerance * loss))
+        done = better & (
+            (step.abs().amax(1) < config.step_tolerance) | (fall <= config.loss_tolerance * loss)
+        )
         # A rejected step this small means that the loss cannot be resolved any further.
         done |= active & solved & ~better & (step.abs().amax(1) < config.step_tolerance)
         x = torch.where(better[:, None], trial, x)
         loss = torch.where(better, trial_loss, loss)
-        new_normal, new_gradient = _normal_equations(residual, jacobian)
         normal = torch.where(better[:, None, None], new_normal, normal)
         gradient = torch.where(better[:, None], new_gradient, gradient)
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
@@ -99,10 +104,10 @@ def levenberg_marquardt(
 
 
 def linearize_by_autograd(residual: Residual) -> Linearize:
-    """Residuals and Jacobian of a residual function by forward-mode differentiation: the reference for every other.
+    """Residuals and Jacobian of a residual function by forward-mode differentiation: the reference.
 
-    Row b of the residuals may depend on row b of x alone. The columns are pushed through together, as one batch of
-    B x P tangents, which keeps the batch axis where the function expects it.
+    Row b of the residuals may depend on row b of x alone. The columns are pushed through together, as one
+    batch of B x P tangents, which keeps the batch axis where the function expects it.
     """
 
     def linearize(x: Tensor) -> tuple[Tensor, Tensor]:

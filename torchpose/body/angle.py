@@ -1,8 +1,9 @@
-"""Angles that people read: anatomical joint angles, the angles between adjoining limbs, and their standard deviations.
+"""Angles that people read: anatomical joint angles, angles between limbs, and their standard deviations.
 
-Radians, of a posed body; the torso's frame is x to the left, y down, z out of the back. Zero is the upright person with
-hanging arms who faces the camera. Flexion is forward (at the knee backward), abduction away from the middle, rotation
-inward; trunk rotation is positive to the person's right, lateral bending positive to the right.
+Radians, of a posed body; the torso's frame is x to the left, y down, z out of the back. Zero is the upright
+person with hanging arms who faces the camera. Flexion is forward (at the knee backward), abduction away from
+the middle, rotation inward; trunk rotation is positive to the person's right, lateral bending positive to the
+right.
 """
 
 import torch
@@ -14,7 +15,9 @@ from torchpose.geometry import angle_between
 from torchpose.least_squares import linearize_by_autograd
 
 SIDES = ("left", "right")
-LIMB_ANGLE_NAMES = tuple(f"{joint}_{side}_limb" for joint in ("elbow", "knee", "shoulder", "hip") for side in SIDES)
+LIMB_ANGLE_NAMES = tuple(
+    f"{joint}_{side}_limb" for joint in ("elbow", "knee", "shoulder", "hip") for side in SIDES
+)
 ANATOMICAL_NAMES = (
     "trunk_flexion",
     "trunk_lateral_bending",
@@ -26,40 +29,50 @@ ANATOMICAL_NAMES = (
     *(f"hip_{motion}_{side}" for motion in ("flexion", "abduction", "rotation") for side in SIDES),
     *(f"knee_flexion_{side}" for side in SIDES),
 )
-_JOINTS = tuple(f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in SIDES)
 
 
 def limb_angles(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batch 8"]:
     """Angles between adjoining limbs, 0 = aligned, in the order of `LIMB_ANGLE_NAMES` (T. 5.1).
 
-    Elbows and knees between their two limbs; shoulders between upper arm and trunk; hips between thigh and trunk. The
-    trunk runs from the middle of the shoulders down to the middle of the hips. `joints` are the contract's fifteen.
+    Elbows and knees between their two limbs; shoulders between upper arm and trunk; hips between thigh and
+    trunk. The trunk runs from the middle of the shoulders down to the middle of the hips. `joints` are the
+    contract's fifteen.
     """
     shoulder, elbow, wrist, hip, knee, ankle = joints[..., 3:, :].unflatten(-2, (6, 2)).unbind(-3)
     trunk = (hip.mean(-2, keepdim=True) - shoulder.mean(-2, keepdim=True)).expand_as(hip)
-    pairs = ((elbow - shoulder, wrist - elbow), (knee - hip, ankle - knee), (elbow - shoulder, trunk), (knee - hip, trunk))
+    pairs = (
+        (elbow - shoulder, wrist - elbow),
+        (knee - hip, ankle - knee),
+        (elbow - shoulder, trunk),
+        (knee - hip, trunk),
+    )
     return torch.cat([angle_between(first, second) for first, second in pairs], -1)
 
 
 def anatomical_angles(body: BodyModel, posed: PosedBody) -> Float[Tensor, "batch 21"]:
     """Joint angles with the names of `ANATOMICAL_NAMES`, from the limbs' directions in the torso's frame.
 
-    Flexion and abduction are those of a hinge pair (flexion first, then abduction, as OpenSim's shoulder and hip);
-    rotation of the upper arm and the thigh is read from the limb below, so a straight elbow or knee leaves it undefined:
-    its standard deviation then says so.
+    Flexion and abduction are those of a hinge pair (flexion first, then abduction, as OpenSim's shoulder and
+    hip); rotation of the upper arm and the thigh is read from the limb below, so a straight elbow or knee
+    leaves it undefined: its standard deviation then says so.
     """
     limb = dict(zip(body.body_names[1:], body.limb_directions(posed).unbind(1), strict=True))
-    # R = Ry(yaw) Rx(pitch) Rz(roll) of the root; a forward bend turns the upper body towards the camera: pitch > 0.
+    # R = Ry(yaw) Rx(pitch) Rz(roll); a forward bend turns the upper body towards the camera: pitch > 0.
     R = posed.rotations[:, 0]
     angles = [
-        torch.asin(-R[:, 1, 2].clamp(-1, 1)),
+        _elevation(-R[:, 1, 2], R[:, 1, :2]),
         -torch.atan2(R[:, 1, 0], R[:, 1, 1]),
         torch.atan2(R[:, 0, 2], R[:, 2, 2]),
         torch.atan2(-limb["head"][:, 2], -limb["head"][:, 1]),
-        -torch.asin(limb["head"][:, 0].clamp(-1, 1)),
+        -_elevation(limb["head"][:, 0], limb["head"][:, 1:]),
     ]
-    shoulder = [_ball(limb[f"upper_arm_{s}"], limb[f"forearm_{s}"], side, -1) for side, s in zip((1, -1), SIDES, strict=True)]
-    hip = [_ball(limb[f"thigh_{s}"], limb[f"shank_{s}"], side, 1) for side, s in zip((1, -1), SIDES, strict=True)]
+    shoulder = [
+        _ball(limb[f"upper_arm_{s}"], limb[f"forearm_{s}"], side, -1)
+        for side, s in zip((1, -1), SIDES, strict=True)
+    ]
+    hip = [
+        _ball(limb[f"thigh_{s}"], limb[f"shank_{s}"], side, 1) for side, s in zip((1, -1), SIDES, strict=True)
+    ]
     elbow = [angle_between(limb[f"upper_arm_{s}"], limb[f"forearm_{s}"]) for s in SIDES]
     knee = [angle_between(limb[f"thigh_{s}"], limb[f"shank_{s}"]) for s in SIDES]
     for ball, hinge in ((shoulder, elbow), (hip, knee)):
@@ -69,16 +82,25 @@ def anatomical_angles(body: BodyModel, posed: PosedBody) -> Float[Tensor, "batch
     return torch.stack(angles, 1)
 
 
+def _elevation(height: Float[Tensor, " batch"], level: Float[Tensor, "batch 2"]) -> Float[Tensor, " batch"]:
+    """Angle of a vector above a plane, from its part across the plane and those in it; exact to the poles."""
+    # A norm has no derivative at zero; the floor makes it 0 there.
+    return torch.atan2(height, (level * level).sum(-1).clamp_min(torch.finfo(level.dtype).tiny).sqrt())
+
+
 def _ball(
     upper: Float[Tensor, "batch 3"], lower: Float[Tensor, "batch 3"], side: int, bend: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Flexion, abduction, inward rotation of a ball joint. `side` is 1 on the left; `bend` is the z to which the lower
-    limb folds at zero rotation: -1 forward (elbow), 1 backward (knee)."""
+    """Flexion, abduction, inward rotation of a ball joint.
+
+    `side` is 1 on the left; `bend` is the z to which the lower limb folds at zero rotation: -1 forward
+    (elbow), 1 backward (knee).
+    """
     x, y, z = upper.unbind(-1)
-    # One ulp inside +-1, where the arcsine's slope is still finite.
-    abduction = torch.asin((side * x).clamp(-1 + 1e-6, 1 - 1e-6))
+    abduction = _elevation(side * x, upper[:, 1:])
     flexion = torch.atan2(-z, y)
-    # The lower limb in the frame that flexion and abduction have turned: across the upper limb, outward and back.
+    # The lower limb across the upper one, in the frame that flexion and abduction have turned: outward and
+    # back.
     cos_f, sin_f, cos_a, sin_a = flexion.cos(), flexion.sin(), abduction.cos(), abduction.sin()
     lx, ly, lz = lower.unbind(-1)
     down, back = cos_f * ly - sin_f * lz, sin_f * ly + cos_f * lz

@@ -1,7 +1,8 @@
 """The articulated body: pose and sizes in; rigid bodies, spheroids and joints in the camera's frame out.
 
-Left-camera frame (x right, y down, z forward); metres and radians. A pose has P = 24 parameters: the root's translation,
-its yaw, pitch and roll, then two per joint. A body's own frame is x to its left, y down, z out of its back.
+Left-camera frame (x right, y down, z forward); metres and radians. A pose has P = 24 parameters: the root's
+translation, its yaw, pitch and roll, then two per joint. A body's own frame is x to its left, y down, z out
+of its back.
 """
 
 from collections.abc import Sequence
@@ -12,12 +13,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose.body.skeleton import HUMAN, ROOT_AXES, Hinges, SizedVector, load_skeleton
+from torchpose.body.skeleton import HUMAN, Hinges, SizedVector, load_skeleton
 from torchpose.geometry import axis_pair_angles, exp_rotation, left_jacobian, rotation_between
 
 
 class JointKind(Enum):
-    """How two degrees of freedom turn a limb: two components of one rotation vector, or two hinges in a row."""
+    """How two degrees of freedom turn a limb: two parts of one rotation vector, or two hinges in a row."""
 
     swing = "swing"
     revolute = "revolute"
@@ -39,7 +40,8 @@ class PosedBody:
     frames: Float[Tensor, "batch parts 3 3"]  # columns: the spheroids' axes, the long one last
     radii: Float[Tensor, "batch parts 2"]  # m: across the long axis, and along it
     joints: Float[Tensor, "batch joints 3"]  # m, in the order of `BodyModel.joint_names`
-    screw_axes: Float[Tensor, "batch parameters 3"]  # unit axis of each parameter
+    # Axis of each parameter: a unit vector, but shorter the further a swing has turned (see `left_jacobian`).
+    screw_axes: Float[Tensor, "batch parameters 3"]
     screw_origins: Float[Tensor, "batch parameters 3"]  # m, a point on it
 
 
@@ -47,14 +49,23 @@ class BodyModel(nn.Module):
     """Forward kinematics of a body file, differentiable in the pose and in the sizes.
 
     The tree's tables (axes, limits, ancestors) are pytorch-kinematics' own, copied into buffers, and with
-    `joint=revolute` the result equals that library's. Geometry is linear in the sizes (B, S), 1 = the body file's.
+    `joint=revolute` the result equals that library's. Geometry is linear in the sizes (B, S), 1 = the body
+    file's. Constants are made in torch's default dtype; `.to` converts them.
     """
 
-    axes: Tensor
-    low: Tensor
+    axes: Tensor  # (P, 3) of each parameter: the root's in the camera's frame, else in the parent body's
+    low: Tensor  # (P,) limits, infinite for the root
     high: Tensor
-    moves: Tensor
-    rest: Tensor
+    moves: Tensor  # (bodies, P) bool: does the parameter move the body?
+    rest: Tensor  # (P - 6,) joint parameters of the rest pose
+    limbs: Tensor  # (J, 3) direction of each limb in its own body
+    centers: Tensor  # (J, 3) direction of each limb at zero, in the parent body
+    align: Tensor  # (J, 3, 3) brings `limbs` to `centers`: the body's rotation at zero
+    offset_basis: Tensor  # (J, 3, S) and so on: times the sizes, vectors in the body's frame
+    center_basis: Tensor
+    joint_basis: Tensor
+    radius_basis: Tensor
+    segment_frames: Tensor  # (K, 3, 3) columns: the spheroid's axes in its body
 
     def __init__(self, config: BodyConfig = BodyConfig()):
         super().__init__()
@@ -86,7 +97,9 @@ class BodyModel(nn.Module):
         depth = [0]
         for parent in self.parents:
             depth.append(depth[parent] + 1)
-        return tuple(tuple(i for i, d in enumerate(depth) if d == level) for level in range(1, max(depth) + 1))
+        return tuple(
+            tuple(i for i, d in enumerate(depth) if d == level) for level in range(1, max(depth) + 1)
+        )
 
     def _register_tree(self) -> None:
         chain = self.skeleton.chain()
@@ -102,10 +115,12 @@ class BodyModel(nn.Module):
         self._constant("low", torch.cat([-free, limits[:, 0]]))
         self._constant("high", torch.cat([free, limits[:, 1]]))
         limbs = torch.tensor([body.limb for body in self.skeleton.bodies])
-        centers = torch.tensor([h.center or b.limb for h, b in zip(hinges, self.skeleton.bodies, strict=True)])
+        centers = torch.tensor(
+            [h.center or b.limb for h, b in zip(hinges, self.skeleton.bodies, strict=True)]
+        )
         self._constant("limbs", limbs)
         self._constant("centers", centers)
-        self._constant("align", exp_rotation(rotation_between(limbs.double(), centers.double())).to(limbs))
+        self._constant("align", exp_rotation(rotation_between(limbs.double(), centers.double())))
         # moves[k, p]: parameter p moves body k. The library lists the frames from the base to each frame.
         on_path = [
             {
@@ -130,7 +145,7 @@ class BodyModel(nn.Module):
         return torch.stack(directions, 1)
 
     def _constant(self, name: str, value: Tensor) -> None:
-        self.register_buffer(name, value.float(), persistent=False)
+        self.register_buffer(name, value.to(torch.get_default_dtype()), persistent=False)
 
     def _register_sizes(self) -> None:
         def basis(vectors: Sequence[SizedVector]) -> Tensor:
@@ -151,7 +166,7 @@ class BodyModel(nn.Module):
         self._constant("radius_basis", radii)
         long_axis = torch.tensor([segment.axis for segment in skeleton.segments])
         up = torch.tensor([0.0, 0.0, 1.0]).expand_as(long_axis)
-        self._constant("segment_frames", exp_rotation(rotation_between(up.double(), long_axis.double())).float())
+        self._constant("segment_frames", exp_rotation(rotation_between(up.double(), long_axis.double())))
 
     def default_size(self, batch: int) -> Float[Tensor, "batch sizes"]:
         return torch.ones(batch, len(self.size_names), dtype=self.axes.dtype, device=self.axes.device)
@@ -168,7 +183,7 @@ class BodyModel(nn.Module):
     def forward(
         self, pose: Float[Tensor, "batch parameters"], size: Float[Tensor, "#batch sizes"] | None = None
     ) -> PosedBody:
-        """Place the body. `size` (B or 1, S) multiplies the body file's lengths and girths; None is all ones."""
+        """Place the body. `size` (B or 1, S) multiplies the file's lengths and girths; None is all ones."""
         B = pose.shape[0]
         if size is None:
             size = self.default_size(1)
@@ -181,12 +196,22 @@ class BodyModel(nn.Module):
             parent = torch.stack([rotations[i] for i in above], 1)  # (B, level, 3, 3)
             turned = parent @ rotation[:, level]
             moved = torch.stack([origins[i] for i in above], 1) + (parent @ shift[:, level, :, None])[..., 0]
-            across = parent[:, :, None] @ axis[:, 6:].unflatten(1, (-1, 2))[:, [i - 1 for i in level]][..., None]
+            across = (
+                parent[:, :, None] @ axis[:, 6:].unflatten(1, (-1, 2))[:, [i - 1 for i in level]][..., None]
+            )
             for slot, i in enumerate(level):
-                rotations[i], origins[i], screw_axes[i] = turned[:, slot], moved[:, slot], across[:, slot, :, :, 0]
+                rotations[i], origins[i], screw_axes[i] = (
+                    turned[:, slot],
+                    moved[:, slot],
+                    across[:, slot, :, :, 0],
+                )
         R, t = torch.stack(rotations, 1), torch.stack(origins, 1)
-        centers = t[:, self.segment_bodies] + _turned(R[:, self.segment_bodies], self.center_basis @ size[:, None, :, None])
-        joints = t[:, self.joint_bodies] + _turned(R[:, self.joint_bodies], self.joint_basis @ size[:, None, :, None])
+        centers = t[:, self.segment_bodies] + _turned(
+            R[:, self.segment_bodies], self.center_basis @ size[:, None, :, None]
+        )
+        joints = t[:, self.joint_bodies] + _turned(
+            R[:, self.joint_bodies], self.joint_basis @ size[:, None, :, None]
+        )
         radii = (self.radius_basis @ size[:, None, :, None])[..., 0].expand(B, -1, -1)
         return PosedBody(
             R,
@@ -202,7 +227,7 @@ class BodyModel(nn.Module):
     def _joints(
         self, pose: Float[Tensor, "batch parameters"], size: Float[Tensor, "#batch sizes"]
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Each body's rotation and shift in its parent's frame, and each parameter's axis there (root: camera's)."""
+        """Bodies' rotations and shifts and parameters' axes in the parents' frames; the root's origins."""
         B = pose.shape[0]
         yaw, pitch, roll = exp_rotation(self.axes[3:6] * pose[:, 3:6, None]).unbind(1)
         turned = yaw @ pitch
@@ -217,19 +242,28 @@ class BodyModel(nn.Module):
         else:
             first, second = exp_rotation(angles[..., None] * axes).unbind(2)
             local = first @ second
-            across = torch.stack([axes[:, 0].expand_as(first[..., 0]), (first @ axes[:, 1, :, None])[..., 0]], 2)
+            across = torch.stack(
+                [axes[:, 0].expand_as(first[..., 0]), (first @ axes[:, 1, :, None])[..., 0]], 2
+            )
         shift = (self.offset_basis @ size[:, None, :, None])[..., 0].expand(B, -1, -1)
         rotation = torch.cat([(turned @ roll)[:, None], local], 1)
         origin = pose[:, None, :3].expand(B, 6, 3)
-        return rotation, torch.cat([origin[:, :1], shift], 1), torch.cat([root_axes, across.flatten(1, 2)], 1), origin
+        return (
+            rotation,
+            torch.cat([origin[:, :1], shift], 1),
+            torch.cat([root_axes, across.flatten(1, 2)], 1),
+            origin,
+        )
 
     def jacobian(
         self, posed: PosedBody, points: Float[Tensor, "batch parts num 3"]
     ) -> Float[Tensor, "batch parts num 3 parameters"]:
-        """Derivative of points fixed to the spheroids by the pose: `axis x (p - origin)`, zero off the path (App. E)."""
+        """Derivative of points fixed to the spheroids: `axis x (p - origin)`, 0 off the path (App. E)."""
         lever = points[..., None, :] - posed.screw_origins[:, None, None]
         turning = torch.linalg.cross(posed.screw_axes[:, None, None].expand_as(lever), lever)
-        columns = torch.cat([posed.screw_axes[:, None, None, :3].expand_as(turning[..., :3, :]), turning[..., 3:, :]], -2)
+        columns = torch.cat(
+            [posed.screw_axes[:, None, None, :3].expand_as(turning[..., :3, :]), turning[..., 3:, :]], -2
+        )
         return (columns * self.part_moves[:, None, :, None]).mT
 
     @property
@@ -245,7 +279,8 @@ class BodyModel(nn.Module):
     ) -> Float[Tensor, "batch parameters"]:
         """The pose whose limbs point along `directions` (unit vectors in the torso's frame, bodies 1 to 9).
 
-        `root_angles` are yaw, pitch and roll, rad. A revolute joint that cannot reach a direction takes the nearest.
+        `root_angles` are yaw, pitch and roll, rad. A revolute joint that cannot reach a direction takes the
+        nearest.
         """
         eye = torch.eye(3, dtype=directions.dtype, device=directions.device)
         turn: list[Tensor] = [eye.expand(len(directions), 3, 3)]
@@ -260,10 +295,14 @@ class BodyModel(nn.Module):
         axes = self.axes[6 + 2 * joint : 8 + 2 * joint].to(toward)
         if self.config.joint is JointKind.swing:
             return rotation_between(self.centers[joint].to(toward).expand_as(toward), toward) @ axes.mT
-        both = axis_pair_angles(axes.expand(len(toward), 2, 3), self.limbs[joint].to(toward).expand_as(toward), toward)
+        both = axis_pair_angles(
+            axes.expand(len(toward), 2, 3), self.limbs[joint].to(toward).expand_as(toward), toward
+        )
         low, high = (limit[6 + 2 * joint : 8 + 2 * joint].to(toward) for limit in (self.low, self.high))
         # Of the two solutions the one within the limits, and of two such the one that turns less.
-        cost = (low - both).clamp_min(0).sum(-1) + (both - high).clamp_min(0).sum(-1) + 1e-3 * both.abs().sum(-1)
+        cost = (
+            (low - both).clamp_min(0).sum(-1) + (both - high).clamp_min(0).sum(-1) + 1e-3 * both.abs().sum(-1)
+        )
         return both[torch.arange(len(both)), cost.argmin(-1)]
 
     def _turn(self, joint: int, angles: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch 3 3"]:
@@ -274,7 +313,9 @@ class BodyModel(nn.Module):
 
     def limb_directions(self, posed: PosedBody) -> Float[Tensor, "batch limbs 3"]:
         """Unit directions of the nine limbs in the torso's frame: the inverse of `pose_from_directions`."""
-        return (posed.rotations[:, :1].mT @ _turned(posed.rotations[:, 1:], self.limbs[:, :, None])[..., None])[..., 0]
+        return (
+            posed.rotations[:, :1].mT @ _turned(posed.rotations[:, 1:], self.limbs[:, :, None])[..., None]
+        )[..., 0]
 
 
 def _turned(rotation: Tensor, column: Tensor) -> Tensor:
@@ -289,4 +330,3 @@ def spheroid_matrix(posed: PosedBody) -> Float[Tensor, "batch parts 4 4"]:
     b = -(A @ posed.centers[..., None])
     corner = (posed.centers[..., None, :] @ -b) + 1
     return torch.cat([torch.cat([A, b], -1), torch.cat([b.mT, corner], -1)], -2)
-

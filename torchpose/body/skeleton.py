@@ -1,11 +1,13 @@
 """The body file: a kinematic tree with sizes, limits, spheroids and reported joints, as plain checked data.
 
-Metres and radians; `human.yaml` is written in metres and degrees. Every vector is given per size (`trunk`, `thigh`, ...),
-so that the whole geometry is linear in the sizes of a person.
+Metres and radians; `human.yaml` is written in metres and degrees. Every vector is given per size (`trunk`,
+`thigh`, ...), so that the whole geometry is linear in the sizes of a person.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from math import radians
+from math import inf, isfinite, radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +19,8 @@ if TYPE_CHECKING:
 Vector = tuple[float, float, float]
 HUMAN = Path(__file__).with_name("human.yaml")
 ROOT_PARAMETERS = ("x", "y", "z", "yaw", "pitch", "roll")
-ROOT_AXES: tuple[Vector, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, 1))
+X, Y, Z, ZERO = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+ROOT_AXES: tuple[Vector, ...] = (X, Y, Z, Y, X, Z)  # of x, y, z, yaw, pitch, roll
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,9 @@ class Skeleton:
         """
         import pytorch_kinematics as pk  # imports matplotlib, so not at the top
 
-        def add(parent: "pk.Frame", name: str, kind: str, axis: Vector, offset: Vector, link: str) -> "pk.Frame":
+        def add(
+            parent: "pk.Frame", name: str, kind: str, axis: Vector, offset: Vector, link: str
+        ) -> "pk.Frame":
             where = pk.Transform3d(pos=list(offset)) if any(offset) else None
             frame = pk.Frame(name=link, link=pk.Link(name=link), joint=pk.Joint(name, where, kind, axis))
             parent.add_child(frame)
@@ -117,29 +122,48 @@ class Skeleton:
         base = frame = pk.Frame(name="camera", link=pk.Link(name="camera"))
         for i, axis in enumerate(ROOT_AXES):
             link = self.root if i == 5 else f"{self.root}_link_{i}"
-            frame = add(frame, self.parameter_names[i], "prismatic" if i < 3 else "revolute", axis, (0, 0, 0), link)
+            frame = add(
+                frame, self.parameter_names[i], "prismatic" if i < 3 else "revolute", axis, ZERO, link
+            )
         frames = [frame]
         for body in self.bodies:
             (one, two), names = body.revolute.axes, (f"{body.name}_1", f"{body.name}_2")
-            frame = add(frames[body.parent], names[0], "revolute", one, body.origin.default(), f"{body.name}_link")
-            frames.append(add(frame, names[1], "revolute", two, (0, 0, 0), body.name))
+            frame = add(
+                frames[body.parent], names[0], "revolute", one, body.origin.default(), f"{body.name}_link"
+            )
+            frames.append(add(frame, names[1], "revolute", two, ZERO, body.name))
         return pk.Chain(base)
 
 
 def load_skeleton(path: Path | str = HUMAN) -> Skeleton:
     """Read and check a body file.
 
-    Raises ValueError, naming the file and the entry, if a key is missing, a name is unknown or a number senseless.
+    Raises ValueError, naming file and entry, if a key is missing, a name is unknown or a number senseless.
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"the body file must exist, got {path}; leave `body.path` empty for the built-in human")
+        raise ValueError(
+            f"the body file must exist, got {path}; leave `body.path` empty for the built-in human"
+        )
     try:
         return _expand(yaml.safe_load(path.read_text()))
-    except (KeyError, TypeError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: a body file needs the keys of human.yaml; wrong or missing here: {error}") from error
+    except (KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
+        raise ValueError(
+            f"{path}: a body file needs the keys of human.yaml; wrong or missing here: {error}"
+        ) from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+@contextmanager
+def _reading(entry: str) -> Iterator[None]:
+    """Name the entry of the body file in every complaint about it."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{entry} needs the key {error}, see human.yaml") from error
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{entry}: {error}") from error
 
 
 def _expand(data: dict[str, Any]) -> Skeleton:
@@ -154,26 +178,32 @@ def _expand(data: dict[str, Any]) -> Skeleton:
         return SizedVector(tuple((name, _vector(value)) for name, value in entry.items()))
 
     def measure(entry: dict[str, Any], kind: str) -> tuple[str, float]:
-        ((name, value),) = entry.items()
-        if name not in data[kind] or not float(value) > 0:
-            raise ValueError(f"a size must be one of {data[kind]} with a positive value in metres, got {entry}")
+        name, value = next(iter(entry.items()))
+        if len(entry) != 1 or name not in data[kind] or not 0 < float(value) < inf:
+            raise ValueError(f"one of {data[kind]} must come with a positive value in metres, got {entry}")
         return name, float(value)
 
+    height = float(data["height"])
+    if not 0 < height < inf:
+        raise ValueError(f"height must be positive, in metres, got {height}")
     roots = [name for name, entry in data["bodies"].items() if entry["parent"] is None]
     if len(roots) != 1:
         raise ValueError(f"exactly one body must have `parent: null`, got {roots}")
-    names, bodies = [roots[0]], []
+    names, bodies, reached = [roots[0]], [], {roots[0]}
 
     def add(name: str, parent: int, side: str) -> None:
         """A body and, depth first, what hangs from it: pytorch-kinematics orders parameters the same way."""
         entry = data["bodies"][name]
-        origin, limb, rest = sized(entry["origin"]), _unit(entry["limb"]), _unit(entry["rest"])
-        swing, revolute = _hinges(name, entry["swing"]), _hinges(name, entry["revolute"])
+        with _reading(f"body {name}"):
+            origin, limb, rest = sized(entry["origin"]), _unit(entry["limb"]), _unit(entry["rest"])
+            swing = _hinges(entry["swing"], _unit(entry["swing"]["center"]))
+            revolute = _hinges(entry["revolute"])
         if side == "_right":
             origin, limb, rest = origin.mirrored(), _mirror(limb), _mirror(rest)
             swing, revolute = _mirror_hinges(swing), _mirror_hinges(revolute)
         bodies.append(Body(name + side, parent, origin, limb, rest, swing, revolute))
         names.append(name + side)
+        reached.add(name)
         descend(name, len(names) - 1, side)
 
     def descend(name: str, index: int, side: str) -> None:
@@ -183,42 +213,52 @@ def _expand(data: dict[str, Any]) -> Skeleton:
                     add(child, index, own)
 
     descend(roots[0], 0, "")
-    unreached = {name.removesuffix("_left").removesuffix("_right") for name in names} ^ set(data["bodies"])
-    if unreached:
+    if unreached := set(data["bodies"]) - reached:
         raise ValueError(f"every body must hang from {roots[0]!r}, these do not: {sorted(unreached)}")
 
     def sides(entry: dict[str, Any]) -> tuple[str, ...]:
         sided = bool(entry.get("sided"))
         wanted = tuple(entry["body"] + side for side in (("_left", "_right") if sided else ("",)))
         if not set(wanted) <= set(names):
-            raise ValueError(f"an entry must stand on a body of the same side, one of {names}, got {wanted}")
+            raise ValueError(f"it must stand on a body of the same side, one of {names}, got {wanted}")
         return wanted
 
     segments, joints = [], []
     for name, entry in data["segments"].items():
-        radius, half_length = measure(entry["radius"], "girths"), measure(entry["half_length"], "lengths")
-        if radius[1] > half_length[1]:
-            raise ValueError(f"segment {name}: half_length must be at least the radius (a <= c), got {half_length} < {radius}")
-        for body in sides(entry):
-            side, center, axis = body.removeprefix(entry["body"]), sized(entry["center"]), _unit(entry["axis"])
-            if side == "_right":
-                center, axis = center.mirrored(), _mirror(axis)
-            segments.append(Segment(name + side, names.index(body), center, axis, radius, half_length))
+        with _reading(f"segment {name}"):
+            radius, half_length = measure(entry["radius"], "girths"), measure(entry["half_length"], "lengths")
+            if radius[1] > half_length[1]:
+                raise ValueError(
+                    f"half_length must be at least the radius (a <= c), got {half_length} < {radius}"
+                )
+            for body in sides(entry):
+                side, center, axis = (
+                    body.removeprefix(entry["body"]),
+                    sized(entry["center"]),
+                    _unit(entry["axis"]),
+                )
+                if side == "_right":
+                    center, axis = center.mirrored(), _mirror(axis)
+                segments.append(Segment(name + side, names.index(body), center, axis, radius, half_length))
     for name, entry in data["joints"].items():
-        for body in sides(entry):
-            side, at = body.removeprefix(entry["body"]), sized(entry["at"])
-            joints.append(Joint(name + side, names.index(body), at.mirrored() if side == "_right" else at))
+        with _reading(f"joint {name}"):
+            for body in sides(entry):
+                side, at = body.removeprefix(entry["body"]), sized(entry["at"])
+                joints.append(
+                    Joint(name + side, names.index(body), at.mirrored() if side == "_right" else at)
+                )
     segments.sort(key=lambda segment: segment.body)  # stable: along the tree, in the file's order on a body
-    height = float(data["height"])
-    if not height > 0:
-        raise ValueError(f"height must be positive, in metres, got {height}")
-    return Skeleton(height, sizes, len(data["lengths"]), roots[0], tuple(bodies), tuple(segments), tuple(joints))
+    return Skeleton(
+        height, sizes, len(data["lengths"]), roots[0], tuple(bodies), tuple(segments), tuple(joints)
+    )
 
 
 def _vector(value: Any) -> Vector:
     if len(value) != 3:
         raise ValueError(f"a vector must have 3 numbers, got {value}")
     x, y, z = (float(v) for v in value)
+    if not (isfinite(x) and isfinite(y) and isfinite(z)):
+        raise ValueError(f"a vector must be finite, got {value}")
     return x, y, z
 
 
@@ -234,17 +274,17 @@ def _mirror(direction: Vector) -> Vector:
     return -direction[0], direction[1], direction[2]
 
 
-def _hinges(name: str, entry: dict[str, Any]) -> Hinges:
-    center = _unit(entry["center"]) if "center" in entry else None
+def _hinges(entry: dict[str, Any], center: Vector | None = None) -> Hinges:
     one, two = (_unit(axis) for axis in entry["axes"])
-    if center is not None:  # a swing's axes lie across its centre, at right angles: made so here, for the reader's ease
+    if center is not None:
+        # A swing's axes lie across its centre, at right angles: made so here, for the reader's ease.
         one = _unit(_across(one, center))
         two = _unit(_across(_across(two, center), one))
     if abs(sum(a * b for a, b in zip(one, two, strict=True))) > 1e-6:
-        raise ValueError(f"body {name}: the two axes must be at a right angle, got {entry['axes']}")
+        raise ValueError(f"the two axes must be at a right angle, got {entry['axes']}")
     (low_1, high_1), (low_2, high_2) = ((radians(low), radians(high)) for low, high in entry["limits"])
     if not (low_1 < high_1 and low_2 < high_2):
-        raise ValueError(f"body {name}: limits must be [lower, upper] in degrees, got {entry['limits']}")
+        raise ValueError(f"limits must be [lower, upper] in degrees, got {entry['limits']}")
     return Hinges((one, two), ((low_1, high_1), (low_2, high_2)), center)
 
 
