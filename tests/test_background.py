@@ -86,6 +86,34 @@ def test_a_darker_and_a_coloured_shadow_is_none():
     assert (log_odds[hair | arm] > 0).float().mean() > 0.97
 
 
+def test_light_is_no_shadow():
+    """A lamp's spot keeps texture and colour as a shadow does, but is brighter: somebody in a pale shirt."""
+    wall, empty = room()
+    patch = rectangle(30, 40, 50, 50)
+    log_odds = BackgroundModel(empty)(picture(torch.where(patch, 1.3 * wall, wall))[None])[0]
+    assert (log_odds[patch] > 0).float().mean() > 0.97
+
+
+def test_a_mixed_edge_belongs_to_the_side_that_gave_more():
+    """A person out of focus by 0.8 px: the silhouette ends where the person is half of a pixel."""
+    wall, empty = room()
+    person = rectangle(20, 60, 80, 40)
+    share = torch.from_numpy(cv2.GaussianBlur(person.numpy().astype(np.float32), (0, 0), 0.8))
+    scene = share * torch.tensor([0.1, 0.15, 0.4])[:, None, None] + (1 - share) * wall
+    log_odds = BackgroundModel(empty)(picture(scene)[None])
+    assert overlap(person_silhouette(log_odds, nothing(log_odds)).mask[0], person) > 0.97
+
+
+def test_a_screen_that_flickers_is_background():
+    wall, frames = room(count=6)
+    screen = rectangle(40, 30, 50, 60)
+    flicker = torch.tensor([0.3, 0.9, 0.1, 0.5, 0.7, 0.2])[:, None, None, None]
+    frames = torch.where(screen, picture(flicker.expand_as(frames)), frames)
+    image = picture(torch.where(screen, 0.8, wall))[None]
+    assert (BackgroundModel(frames)(image)[0][screen] > 0).float().mean() < 0.02
+    assert (BackgroundModel(frames[:1])(image)[0][screen] > 0).float().mean() > 0.9  # unless seen to flicker
+
+
 def test_texture_gives_away_what_has_the_background_s_colour():
     """Striped in shades of the plain wall's own grey: each pixel may be in a shadow, the whole cannot."""
     wall = torch.full((3, *SIZE), 0.6)
@@ -162,6 +190,17 @@ def test_depth_out_of_the_person_s_range_goes_and_the_background_s_too():
     without = person_silhouette(log_odds, depth).mask[0]
     assert not (without & erosion_of(far, 2)).any()
     assert (without & shadow).any()  # only the background's depth tells it
+
+
+def test_the_person_is_what_stands_before_the_background():
+    """A larger stain on the wall does not draw the range of depth away from the person."""
+    log_odds = torch.full((1, *SIZE), -6.0)
+    person, stain = rectangle(20, 20, 80, 30), rectangle(10, 70, 100, 80)
+    log_odds[0, person | stain] = 2.5
+    background = torch.full(SIZE, 3.5)
+    depth = torch.where(person, 1.5, background)[None]
+    found = person_silhouette(log_odds, depth, background_depth=background).mask[0]
+    assert same(found, person, corners=4)
 
 
 def test_depth_fills_what_looks_like_a_shadow():
@@ -256,6 +295,8 @@ def test_depth_background_tells_the_person_and_its_noise_grows():
     assert (log_odds[:, rectangle(5, 100, 5, 30)] == 0).all()
     found = person_silhouette(log_odds, seen, background_depth=model.depth).mask
     assert min(overlap(mask, person) for mask in found) > 0.9
+    door = torch.full((1, *SIZE), 9.0)  # opened: what is behind the background is nobody
+    assert (model(door)[:, 40:] <= 0.5).all()
     near, far = (model.depth[60] - 1.1).abs().argmin(), (model.depth[60] - 5.9).abs().argmin()
     closer = model.depth.clone()[None] - 0.1
     change = model(closer)[0, 60]

@@ -70,6 +70,7 @@ def noise_line(frames: Float[Tensor, "frames 3 height width"]) -> Float[Tensor, 
     if not rows:
         return square.new_zeros(2)
     middle, variance, weight = torch.stack(rows).unbind(1)
+    variance = torch.minimum(variance, 4 * variance.median())  # a screen that flickers fills a bin of its own
     weight = weight / weight.sum()
     center = (weight * middle).sum()
     # The tiny pull keeps the slope at 0 in a scene of one intensity.
