@@ -29,6 +29,7 @@ from torchpose.registration.likelihood import (
     appearance_potential,
 )
 from torchpose.registration.silhouette import nearest_inside
+from torchpose.registration.size import SizeConfig, fit_size, stack_observations
 from torchpose.registration.start import StartConfig, Starter
 from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
 from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
@@ -79,7 +80,8 @@ class PoseConfig:
     start: StartConfig = field(default_factory=StartConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     height: float = 0.0  # m, of the person; 0 measures it
-    height_frames: int = 8  # of the recording, from which it is measured
+    size: SizeConfig = field(default_factory=SizeConfig)
+    size_frames: int = 6  # of the recording, from which height and proportions are measured
     cells: CellConfig = field(default_factory=CellConfig)  # of the geodesic term
 
 
@@ -215,6 +217,7 @@ class StereoToPose(nn.Module):
         self.tracker = Tracker(self.body, config.tracking, registrar, starter)
         self.register_buffer("size", self.body.default_size(1), persistent=False)
         self.stopwatch = self.eyes.stopwatch
+        self._seen: dict[int, Sight] = {}
 
     @property
     def device(self) -> torch.device:
@@ -233,14 +236,26 @@ class StereoToPose(nn.Module):
         return Observation(sight.cloud, potential, nearest_inside(sight.silhouette), self.camera, geodesic)
 
     def prepare(self, recording: Recording) -> None:
-        """Learn the recording's background and the person's height."""
+        """Learn the recording's background and the person's size."""
         self.eyes.learn_background(recording.background(), recording, self.device)
         self.tracker.forget()
-        height = self.config.height
-        if height == 0:
-            frames = _readable(recording, _spread(len(recording), self.config.height_frames))
-            height = self.measure_height([self.eyes(frame, self.device) for frame in frames])
-        self.size = self.body.size_of_height(height)
+        frames = _readable(recording, _spread(len(recording), self.config.size_frames))
+        # These frames come again in their turn; what was seen of them is kept until then.
+        self._seen = {frame.index: self.eyes(frame, self.device) for frame in frames}
+        with self.stopwatch.measure("size"):
+            self.size = self.measure_size(list(self._seen.values()))
+
+    def measure_size(self, sights: list[Sight]) -> Float[Tensor, "1 sizes"]:
+        """Lengths and girths of the person in these frames; the body file's where no pose is found in any."""
+        size = self.body.size_of_height(self.config.height or self.measure_height(sights))
+        seen = [(self.observe(sight), sight.faces) for sight in sights if sight.present]
+        found = [(observation, self.tracker.starter(observation, faces, size)) for observation, faces in seen]
+        found = [(observation, fit) for observation, fit in found if self.tracker.acceptable(fit)]
+        if not found or self.config.size.rounds == 0:
+            return size
+        observation = stack_observations([observation for observation, _ in found])
+        poses = torch.cat([fit.pose for _, fit in found])
+        return fit_size(self.tracker.registrar, observation, poses, size, self.config.size)[0]
 
     def measure_height(self, sights: list[Sight]) -> float:
         """The person's height, m: from the head's top to the lowest point, the greatest of the frames.
@@ -249,12 +264,11 @@ class StereoToPose(nn.Module):
         (the tallest may hold a stray point). Without a whole person it is the body file's height.
         """
         heights = sorted(_upright_extent(sight) for sight in sights if sight.present and not sight.cut)
-        default = self.body.height
         if not heights:
-            return default
+            return self.body.height
         # The cloud's rim lies half a grid step inside the silhouette, at the head and at the feet.
         measured = heights[-2] if len(heights) > 2 else heights[-1]
-        return min(max(measured + 0.03, 0.8 * default), 1.2 * default)
+        return min(max(measured + 0.03, 0.95 * self.body.height), 1.2 * self.body.height)
 
     def forward(self, recording: Recording) -> Iterator[FramePose]:
         """Poses of a prepared recording's frames, in order. A frame that cannot be read is lost, and said so."""
@@ -268,7 +282,9 @@ class StereoToPose(nn.Module):
 
     def follow(self, frame: Frame) -> FramePose:
         """The next frame's pose."""
-        sight = self.eyes(frame, self.device)
+        sight = self._seen.pop(frame.index, None)
+        if sight is None:
+            sight = self.eyes(frame, self.device)
         with self.stopwatch.measure("registration"):
             observation = self.observe(sight) if sight.present else None
             tracked = self.tracker(frame.time_s, observation, sight.faces, self.size, sight.cut)

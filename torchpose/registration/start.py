@@ -28,10 +28,11 @@ ARMS = (
     ((0.2, 0.9, -0.4), (-0.2, -0.8, -0.7)),
     ((0.3, 0.6, -0.8), (-0.2, 0.3, -0.9)),
 )
-# The same for thigh and shank: standing, sitting or knee raised, stepping back, to the side.
+# The same for thigh and shank: standing, sitting or knee raised, crouching, stepping back, to the side.
 LEGS = (
     ((0.08, 1.0, -0.03), (0.05, 1.0, 0.03)),
     ((0.2, 0.25, -1.0), (0.1, 1.0, 0.0)),
+    ((0.1, 0.85, -0.5), (0.05, 0.85, 0.5)),
     ((0.1, 0.9, 0.3), (0.05, 0.6, 0.8)),
     ((0.6, 0.8, -0.2), (0.2, 1.0, 0.0)),
 )
@@ -44,10 +45,11 @@ class StartConfig:
     final_rounds: int = 8  # of the best few, on all points
     finalists: int = 4
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
-    face_yaws: tuple[float, ...] = (-40.0, 0.0, 40.0)  # degrees, tried when a face is seen
+    good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
+    refreshes: int = 1  # at the most
+    face_yaws: tuple[float, ...] = (-65.0, -25.0, 25.0, 65.0)  # degrees, tried when a face is seen
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
     back_penalty: float = 0.004  # m of misfit that a pose turned away from the camera must make good
-    sitting: bool = True  # also try bent legs
 
     def __post_init__(self) -> None:
         for name in ("points", "rounds", "final_rounds", "finalists"):
@@ -73,7 +75,16 @@ class Starter(nn.Module):
         self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
     ) -> Registration:
         """Register one frame (batch 1) without a known pose."""
-        return self._search(observation, self.hypotheses(observation, faces, size), size, self.config.sigma)
+        starts = self.hypotheses(observation, faces, size)
+        found = self._search(observation, starts, size, self.config.sigma)
+        for _ in range(self.config.refreshes):
+            if float(found.misfit) < self.config.good_misfit:
+                break
+            better = self.refresh(observation, found.pose, size)
+            if not bool(better.misfit < found.misfit):
+                break
+            found = better
+        return found
 
     def refresh(
         self, observation: Observation, pose: Float[Tensor, "1 parameters"], size: Float[Tensor, "#batch sizes"]
@@ -109,9 +120,7 @@ class Starter(nn.Module):
     ) -> Float[Tensor, "starts parameters"]:
         """Poses to start from: headings x arms, standing, and a few sitting."""
         yaws = self.config.face_yaws if bool(faces.found[0]) else self.config.yaws
-        limbs = [(arm, LEGS[0]) for arm in ARMS]
-        if self.config.sitting:
-            limbs += [(ARMS[0], LEGS[1]), (ARMS[1], LEGS[1])]
+        limbs = [(arm, LEGS[0]) for arm in ARMS] + [(ARMS[1], leg) for leg in LEGS[1:3]]
         directions = torch.stack([_directions(arm, leg) for arm, leg in limbs]).to(size)
         heading = torch.tensor([radians(yaw) for yaw in yaws]).to(size)
         Y, L = len(heading), len(limbs)

@@ -132,14 +132,18 @@ class Registrar(nn.Module):
             share = i / max(rounds - 1, 1)
             sigma = sigma_first ** (1 - share) * config.sigma_last**share
             posed = self.body(pose, size)
-            foot = foot_point(posed, observation.cloud.points, config.visible)
+            foot = self.correspond(posed, observation)
             labelling = self.label(posed, foot, observation, sigma)
             bounds.append(labelling.bound[-1])
             rows, support = self.rows(posed, foot, labelling, observation)
-            full = self._with_rest(prior, support)
+            full = self.with_rest(prior, support)
             solution = fit_pose(self.body, pose, size, rows, full, config.fitting)
             pose, status = solution.value, solution.status
         return self._result(observation, pose, size, prior, torch.stack(bounds), status)
+
+    def correspond(self, posed: PosedBody, observation: Observation) -> FootPoint:
+        """The model's point that answers for each data point, on every part."""
+        return foot_point(posed, observation.cloud.points, self.config.visible)
 
     def label(self, posed: PosedBody, foot: FootPoint, observation: Observation, sigma: float) -> Labelling:
         """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled."""
@@ -202,7 +206,7 @@ class Registrar(nn.Module):
         three = [x.flatten(1, 2).repeat_interleave(3, 1) for x in (local, target)]
         return Rows(part.flatten(1).repeat_interleave(3, 1), three[0], three[1], direction)
 
-    def _with_rest(self, prior: PosePrior, support: Float[Tensor, "batch parts"]) -> PosePrior:
+    def with_rest(self, prior: PosePrior, support: Float[Tensor, "batch parts"]) -> PosePrior:
         """The prior, joined by a pull towards the rest pose on every joint below which little is seen."""
         if self.config.rest_sd == 0:
             return prior
@@ -225,14 +229,17 @@ class Registrar(nn.Module):
     ) -> Registration:
         config, cloud = self.config, observation.cloud
         posed = self.body(pose, size)
-        foot = foot_point(posed, cloud.points, config.visible)
+        foot = self.correspond(posed, observation)
         labelling = self.label(posed, foot, observation, config.sigma_last)
         rows, support = self.rows(posed, foot, labelling, observation)
-        full = self._with_rest(prior, support)
+        full = self.with_rest(prior, support)
         _, jacobian = linearize_by_screws(self.body, size, rows, full, config.fitting)(pose)
         information = jacobian.mT @ jacobian
         factor, failed = torch.linalg.cholesky_ex(information)
-        covariance = torch.where((failed == 0)[:, None, None], torch.cholesky_inverse(factor), torch.inf)
+        known = (failed == 0)[:, None, None]
+        # cholesky_inverse raises for the whole batch where one factor is singular.
+        eye = torch.eye(pose.shape[1], dtype=pose.dtype, device=pose.device)
+        covariance = torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.distance.amin(1) * cloud.mask
         misfit = nearest.clamp_max(0.2).sum(1) / count

@@ -36,7 +36,7 @@ class TrackingConfig:
     velocity: float = 0.8  # share of the last velocity that the prediction keeps; 0 starts from the last pose
     joint_speed_sd: float = 8.0  # rad/s by which a joint departs from the prediction
     root_speed_sd: float = 2.0  # m/s and rad/s, the same for the root
-    accept_misfit: float = 0.040  # m: a pose that fits worse is none
+    accept_misfit: float = 0.055  # m: a pose that fits worse is none
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.03  # of the points straying: a limb may be lost, and is sought elsewhere
     memory: float = 2.0  # s after which a lost person is forgotten
@@ -73,6 +73,7 @@ class Tracker(nn.Module):
         self._pose: Tensor | None = None
         self._velocity: Tensor | None = None  # per second
         self._time = 0.0
+        self._known_stray = 0.0
 
     def begin(self, pose: Float[Tensor, "1 parameters"], time_s: float) -> None:
         """Take a known pose as the last one: the next frame follows it instead of searching."""
@@ -99,23 +100,28 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.absent, None)
         if self._pose is None:
             found = self.starter(observation, faces, size)
-            if not self._acceptable(found):
+            if not self.acceptable(found):
                 return TrackedFrame(TrackStatus.entering, None)
             self._remember(found, time_s)
             return TrackedFrame(TrackStatus.partial if cut else TrackStatus.tracked, found)
         status = TrackStatus.partial if cut else TrackStatus.tracked
         found = self._follow(observation, size, time_s)
-        if self._doubtful(found):
+        stray = self._stray(found)
+        # Points that stayed without a part after a search (a bag, a skirt) are no reason for another one.
+        if stray > max(self.config.stray_share, 1.5 * self._known_stray) or not self.acceptable(found):
             # First the limbs: where one moved too fast to follow, its points are there without a part.
             better = self.starter.refresh(observation, found.pose, size)
-            if is_finite(better)[0] and better.misfit < found.misfit:
+            if bool(is_finite(better)[0]) and bool(better.misfit < found.misfit):
                 found = better
-        if not self._acceptable(found):
+            self._known_stray = self._stray(found)
+        else:
+            self._known_stray = min(self._known_stray, stray)
+        if not self.acceptable(found):
             anew = self.starter(observation, faces, size)
-            if self._acceptable(anew):
+            if self.acceptable(anew):
                 found, status = anew, TrackStatus.recovered
                 self._velocity = None
-        if not self._acceptable(found):
+        if not self.acceptable(found):
             return TrackedFrame(TrackStatus.lost, None)
         self._remember(found, time_s)
         return TrackedFrame(status, found)
@@ -136,12 +142,13 @@ class Tracker(nn.Module):
         both = self.registrar(observation, starts, size, prior)
         return select(both, both.misfit.argmin())
 
-    def _doubtful(self, found: Registration) -> bool:
+    def _stray(self, found: Registration) -> float:
+        """Share of the points that lie far from the model."""
         points = (found.distance > 0).sum().clamp_min(1)
-        stray = (found.distance > self.config.stray_distance).sum() / points
-        return float(stray) > self.config.stray_share or not self._acceptable(found)
+        return float((found.distance > self.config.stray_distance).sum() / points)
 
-    def _acceptable(self, found: Registration) -> bool:
+    def acceptable(self, found: Registration) -> bool:
+        """Whether a registration fits well enough to be believed."""
         return bool(is_finite(found)[0]) and float(found.misfit) < self.config.accept_misfit
 
     def _remember(self, found: Registration, time_s: float) -> None:
