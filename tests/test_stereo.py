@@ -21,7 +21,9 @@ from torchpose.vision.stereo import (
     best_rival,
     component_sizes,
     fill,
+    given_seeds,
     grow,
+    match,
     smooth,
     without_islands,
 )
@@ -415,6 +417,80 @@ def test_growth_stops_where_it_is_told() -> None:
     on_ridge = grow(ridge.flatten(), seeds, space, GrowingSeedsConfig())
     assert (space.layer(on_ridge) == 3).double().mean() > 0.9
     assert (space.layer(full) == 3).double().mean() < 0.5
+
+
+def volume_of(space: DisparitySpace, cells: dict[tuple[int, int, int], float]) -> Tensor:
+    """Similarities 0 but at the cells (row, layer, column), counted with the padding."""
+    volume = torch.zeros(space.height + 2, space.layers, space.columns)
+    for place, value in cells.items():
+        volume[place] = value
+    return volume.flatten()
+
+
+def cell_at(space: DisparitySpace, row: int, layer: int, column: int) -> int:
+    return (row * space.layers + layer) * space.columns + column
+
+
+def test_known_disparities_become_the_cells_of_their_pixels() -> None:
+    space = DisparitySpace(2, 10, 20, 6, 8, 5, 9)
+    seeds = torch.full((2, 6, 8), torch.nan)
+    seeds[0, 2, 3], seeds[1, 5, 7], seeds[1, 0, 0], seeds[0, 1, 1] = 7.4, 13.0, 5.0, 6.0
+    seeds[1, 3, 3], seeds[1, 3, 4] = 4.4, 14.0  # out of the range
+    mask = torch.ones(2, 6, 8, dtype=torch.bool)
+    mask[0, 1, 1] = False
+    index = torch.arange(2 * 8 * 11 * 12).view(2, 8, 11, 12)
+    expected = [index[0, 3, 3, 5], index[1, 1, 1, 2], index[1, 6, 9, 9]]
+    assert sorted(given_seeds(seeds, mask, space).tolist()) == sorted(int(cell) for cell in expected)
+
+
+@pytest.mark.parametrize(("value", "accepted"), [(0.85, True), (0.75, False)])
+def test_a_cell_grows_if_it_is_not_much_worse_than_the_best_at_both_its_pixels(
+    value: float, accepted: bool
+) -> None:
+    space = region(12, 30, 9)
+    above, at_left, at_right, offered = (4, 5, 12), (5, 3, 12), (5, 2, 9), (5, 5, 12)
+    volume = volume_of(space, {above: 0.9, at_left: 0.9, at_right: 0.9, offered: value})
+    cells = {place: cell_at(space, *place) for place in (above, at_left, at_right, offered)}
+
+    def grown(*seeds: tuple[int, int, int]) -> list[int]:
+        return grow(
+            volume, torch.tensor([cells[seed] for seed in seeds]), space, GrowingSeedsConfig()
+        ).tolist()
+
+    assert (cells[offered] in grown(above, at_left, at_right)) == accepted
+    assert cells[offered] in grown(above, at_left)  # one of the pixels has nothing better
+
+
+@pytest.mark.parametrize("shared", ["left", "right"])
+@pytest.mark.parametrize(("rival", "wins"), [(0.75, False), (0.65, True)])
+def test_a_match_beats_its_rivals_by_a_margin(shared: str, rival: float, wins: bool) -> None:
+    space = region(5, 30, 9)
+    best = (2, 3, 15)
+    other = (2, 7, 15) if shared == "left" else (2, 7, 19)
+    volume = volume_of(space, {best: 0.8, other: rival})
+    cells = torch.tensor([cell_at(space, *best), cell_at(space, *other)])
+    layers, similarity = match(volume, cells, space, GrowingSeedsConfig())
+    assert layers.isfinite().sum() == int(wins)
+    if wins:
+        pixel = 2 * space.columns + 15
+        assert_close(layers[pixel], torch.tensor(3.0))
+        assert_close(similarity[pixel], torch.tensor(0.8))
+
+
+def test_filling_takes_no_right_pixel_from_another() -> None:
+    space = region(3, 20, 9)
+    volume = torch.full((5, 11, 24), 0.8).flatten()
+    layers = torch.full((1, 3, 20), torch.nan)
+    layers[0, :, 15:] = 6.0
+    layers[0, 1, 8] = 2.0  # its right pixel is that of column 12 at layer 6
+    mask = torch.ones(1, 3, 20, dtype=torch.bool)
+    mask[0, :, :11] = False
+    known = space.pad(layers, torch.nan)
+    config = GrowingSeedsConfig(fill_smoothness=10.0)  # keep to the neighbours' mean
+    filled = space.unpad(fill(volume, known, torch.zeros_like(known), mask, space, config)[0])[0]
+    assert filled[1, 12].isnan()
+    assert filled[:, 11:].isnan().sum() == 1
+    assert (filled[0, 11:] == 6.0).all()
 
 
 def test_the_best_rival_is_far_enough() -> None:
