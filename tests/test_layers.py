@@ -32,7 +32,10 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "synthesis": ("motion", "room", "render", "database"),
     "learning": ("part_network", "training"),
-    "the desk": ("calibration", "recording", "export", "figures", "pipeline", "cli"),
+    "the desk": (
+        *("calibration", "recording", "rendered", "export", "figures"),
+        *("pipeline", "session", "study", "cli"),
+    ),
 }
 ORDER = [
     f"torchpose.{file}" if room.startswith("the ") else f"torchpose.{room}.{file}"
