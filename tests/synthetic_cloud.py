@@ -1,4 +1,4 @@
-"""What a camera would see of a posed body: exact surface points on a grid of pixels, by casting rays at spheroids.
+"""What a camera would see of a posed body: surface points on a grid of pixels, by casting rays at spheroids.
 
 Nothing of torchpose's own distances, sampling or rendering is used, only where the spheroids are.
 """
@@ -17,7 +17,7 @@ from torchpose.vision.faces import Faces
 from torchpose.vision.points import PointCloud
 
 CAMERA = StereoCamera(width=320, height=240, focal_length=320.0, cx=161.0, cy=117.0, baseline=0.12)
-# Limbs of a relaxed person who faces the camera, in the torso's frame: head, left arm, right arm, left leg, right leg.
+# Limbs of a relaxed person in the torso's frame: head, left arm, right arm, left leg, right leg.
 RELAXED = torch.tensor(
     [
         *[[0.0, -1.0, -0.1]],
@@ -61,7 +61,7 @@ def standing(
 def cast(
     posed: PosedBody, rays: Float[Tensor, "rays 3"]
 ) -> tuple[Float[Tensor, " rays"], Int[Tensor, " rays"]]:
-    """How far along each ray from the camera (in units of the ray) the body is, inf where it is missed, and which part.
+    """How far along each ray from the camera the body is, in rays, inf where it is missed, and which part.
 
     In the frame of a spheroid scaled to the unit ball, |o + t d|^2 = 1 is a quadratic equation.
     """
@@ -84,7 +84,7 @@ def see(
     generator: torch.Generator | None = None,
     camera: StereoCamera = CAMERA,
 ) -> View:
-    """A view of one pose (1, P) with at most `num` points; `noise` is the standard deviation of their depth, m."""
+    """A view of one pose (1, P) with at most `num` points, whose depths have standard deviation `noise`, m."""
     posed = body(pose, size)
     u, v = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
     pixels = torch.stack([u, v], -1).flatten(0, 1).to(pose)
@@ -141,7 +141,7 @@ def together(views: list[View]) -> Observation:
 
 
 def mirrored(view: View) -> View:
-    """The view of the mirrored scene: x changes its sign. The camera must have its axis in the image's middle."""
+    """The view of the mirrored scene: x changes its sign. The camera's axis must be in the image's middle."""
     cloud, width = view.cloud, view.camera.width
     flip = torch.tensor([-1.0, 1.0, 1.0]).to(cloud.points)
     pixels = torch.stack([width - 1 - cloud.pixels[..., 0], cloud.pixels[..., 1]], -1)

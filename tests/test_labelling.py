@@ -255,7 +255,7 @@ def test_the_geodesic_field_is_equation_3_12(outlier):
 
 
 def test_the_geodesic_term_moves_a_label_that_is_too_far_away():
-    """A lone point, almost as likely either part, lies 1 m along the body from three of the first: it is none.
+    """A lone point, almost as likely either part, lies 1 m of body away from three of the first part.
 
     It is too far from their cell to be the first part, and too near its own cell, which is of the second.
     """

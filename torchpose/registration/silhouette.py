@@ -73,15 +73,16 @@ def silhouette_rows(
     index = pixel.detach().round().clamp(min=torch.zeros_like(edge), max=edge).long()
     flat = (index[..., 1] * W + index[..., 0])[..., None].expand(-1, -1, 2)
     goal = nearest.flatten(1, 2).expand(B, -1, -1).gather(1, flat).to(points)
-    gap = pixel - goal
-    length = gap.norm(dim=-1)
-    unit = gap / length.clamp_min(1e-6)[..., None]
+    # From whole pixel to whole pixel: what rounding leaves of the rest must not turn the way.
+    unit = torch.nn.functional.normalize(index - goal, dim=-1)
+    length = ((pixel - goal) * unit).sum(-1)
     outside = seen & (length > 1)
     # Along the ray the rim may move freely: the direction is that of the image plane, across the ray.
     across = torch.cat([unit, -(unit * points[..., :2]).sum(-1, keepdim=True) / depth[..., None]], -1)
     metres = length * depth / camera.focal_length
     pull = (config.reach / metres.clamp_min(config.reach)) * (config.weight**0.5 / config.sd)
-    return Rows(part, local, camera.back_project(goal, depth), across * (outside * pull)[..., None])
+    target = camera.back_project(goal, depth)
+    return Rows(part, local, target, across * (outside * pull)[..., None])
 
 
 def overhang(
