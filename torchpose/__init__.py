@@ -1,1 +1,73 @@
 """torchpose: markerless joint angles and activities of a person from a stereo or depth camera, as tensor programs."""
+
+__version__ = "0.1.0"
+
+from torchpose.activity.dataset import Clip, read_skeletons
+from torchpose.activity.recognizer import Recognizer, RecognizerConfig
+from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, limb_angles
+from torchpose.body.ellipsoid import algebraic_distance, foot_point, nearest_point
+from torchpose.body.model import BodyConfig, BodyModel, PosedBody
+from torchpose.export import PoseSequence, read_poses_csv, read_poses_npz
+from torchpose.least_squares import LMConfig, levenberg_marquardt
+from torchpose.pipeline import Eyes, EyesConfig, PoseConfig, StereoToPose
+from torchpose.recording import Frame, Recording, open_recording, write_recording
+from torchpose.registration.likelihood import Evidence, PartLikelihood
+from torchpose.registration.vem import Observation, Registrar, RegistrationConfig
+from torchpose.rendered import demo_recording
+from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
+from torchpose.vision.background import BackgroundModel, DepthBackground, person_silhouette
+from torchpose.vision.camera import RawStereo, StereoCamera
+from torchpose.vision.faces import FaceDetector, Faces
+from torchpose.vision.points import PointCloud, group_cells, sample_grid
+from torchpose.vision.stereo import Disparity, GrowingSeeds
+
+__all__ = [
+    "ANATOMICAL_NAMES",
+    "LIMB_ANGLE_NAMES",
+    "BackgroundModel",
+    "BodyConfig",
+    "BodyModel",
+    "Clip",
+    "DepthBackground",
+    "Disparity",
+    "Evidence",
+    "Eyes",
+    "EyesConfig",
+    "FaceDetector",
+    "Faces",
+    "Frame",
+    "GrowingSeeds",
+    "LMConfig",
+    "Observation",
+    "PartLikelihood",
+    "PointCloud",
+    "PoseConfig",
+    "PoseSequence",
+    "PosedBody",
+    "RawStereo",
+    "Recognizer",
+    "RecognizerConfig",
+    "Recording",
+    "Registrar",
+    "RegistrationConfig",
+    "StereoCamera",
+    "StereoToPose",
+    "TrackStatus",
+    "Tracker",
+    "TrackingConfig",
+    "algebraic_distance",
+    "anatomical_angles",
+    "demo_recording",
+    "foot_point",
+    "group_cells",
+    "levenberg_marquardt",
+    "limb_angles",
+    "nearest_point",
+    "open_recording",
+    "person_silhouette",
+    "read_poses_csv",
+    "read_poses_npz",
+    "read_skeletons",
+    "sample_grid",
+    "write_recording",
+]

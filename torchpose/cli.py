@@ -9,7 +9,11 @@ from typing import Any, Literal, overload
 
 import torch
 
-from torchpose.pipeline import EyesConfig, PoseConfig
+from torchpose import __version__
+from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
+from torchpose.recording import Recording, open_recording
+from torchpose.rendered import demo_recording
+from torchpose.session import Session, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups, describe
 
 PACKAGE = Path(__file__).resolve().parent
@@ -100,7 +104,15 @@ def train_main(argv: Sequence[str]) -> int:
 
 def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
-    raise NotImplementedError
+    if config.recording is None:
+        print("no recording given: making one (recording=DIR runs yours)")
+        recording: Recording = demo_recording(config.seed)
+    else:
+        recording = open_recording(config.recording)
+    model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
+    output = Path(config.output)
+    session = Session(model, recording, output, settings_of(config), __version__)
+    print(summary_table(session.run(config.fresh, config.max_frames), output))
 
 
 def train(config: TrainConfig, device: torch.device) -> None:

@@ -235,9 +235,13 @@ class StereoToPose(nn.Module):
             geodesic = geodesic_term(cells, bounds, outlier=self.config.registration.outlier > 0)
         return Observation(sight.cloud, potential, nearest_inside(sight.silhouette), self.camera, geodesic)
 
-    def prepare(self, recording: Recording) -> None:
-        """Learn the recording's background and the person's size."""
+    def learn_background(self, recording: Recording) -> None:
+        """Learn the empty scene of the recording."""
         self.eyes.learn_background(recording.background(), recording, self.device)
+
+    def prepare(self, recording: Recording) -> None:
+        """Learn the recording's empty scene and the person's size, and forget any other person."""
+        self.learn_background(recording)
         self.tracker.forget()
         frames = _readable(recording, _spread(len(recording), self.config.size_frames))
         # These frames come again in their turn; what was seen of them is kept until then.
@@ -271,14 +275,17 @@ class StereoToPose(nn.Module):
         return min(max(measured + 0.03, 0.95 * self.body.height), 1.2 * self.body.height)
 
     def forward(self, recording: Recording) -> Iterator[FramePose]:
-        """Poses of a prepared recording's frames, in order. A frame that cannot be read is lost, and said so."""
+        """Poses of a prepared recording's frames, in order."""
         for position in range(len(recording)):
-            try:
-                frame = recording[position]
-            except UnreadableFrame as error:
-                yield FramePose(error.index, error.time_s, TrackStatus.lost, None, None, str(error))
-                continue
-            yield self.follow(frame)
+            yield self.step(recording, position)
+
+    def step(self, recording: Recording, position: int) -> FramePose:
+        """The pose of one frame, the next in order. A frame that cannot be read is lost, and says why."""
+        try:
+            frame = recording[position]
+        except UnreadableFrame as error:
+            return FramePose(error.index, error.time_s, TrackStatus.lost, None, None, str(error))
+        return self.follow(frame)
 
     def follow(self, frame: Frame) -> FramePose:
         """The next frame's pose."""

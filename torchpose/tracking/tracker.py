@@ -75,6 +75,23 @@ class Tracker(nn.Module):
         self._time = 0.0
         self._known_stray = 0.0
 
+    def state(self) -> dict[str, Tensor]:
+        """What the next frame starts from, as tensors; empty where nothing is remembered."""
+        if self._pose is None:
+            return {}
+        state = {"pose": self._pose, "time": torch.tensor(self._time, dtype=torch.float64)}
+        if self._velocity is not None:
+            state["velocity"] = self._velocity
+        return state | {"known_stray": torch.tensor(self._known_stray, dtype=torch.float64)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on from a `state`."""
+        self.forget()
+        if state:
+            self._pose, self._time = state["pose"].to(self.body.axes), float(state["time"])
+            self._velocity = state["velocity"].to(self.body.axes) if "velocity" in state else None
+            self._known_stray = float(state["known_stray"])
+
     def begin(self, pose: Float[Tensor, "1 parameters"], time_s: float) -> None:
         """Take a known pose as the last one: the next frame follows it instead of searching."""
         self._pose, self._velocity, self._time = pose, None, time_s

@@ -1,0 +1,220 @@
+"""One recording from beginning to end: poses in parts that an interrupted run finds again, then every file at once.
+
+Angles are in radians in memory and in degrees in the files; metres, left-camera frame.
+"""
+
+import dataclasses
+import hashlib
+import json
+import shutil
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from tqdm import tqdm
+
+from torchpose.atomic import replacing
+from torchpose.body.ellipsoid import outline
+from torchpose.export import (
+    PoseSequence,
+    open_video,
+    read_poses_npz,
+    write_poses_csv,
+    write_poses_npz,
+    write_summary,
+)
+from torchpose.figures import Overlay, draw_overlay, plot_angles
+from torchpose.pipeline import FramePose, StereoToPose
+from torchpose.recording import Recording, UnreadableFrame
+
+PART = 50  # frames between two savings: what an interruption costs at the most
+_SHOWN = ("elbow_flexion_left", "elbow_flexion_right", "knee_flexion_left", "knee_flexion_right")
+
+
+@dataclass(frozen=True)
+class _Labelled:
+    """The labelled points of some frames, for the overlay alone."""
+
+    pixels: Float[Tensor, "time num 2"]
+    labels: Int[Tensor, "time num"]
+
+
+class Session:
+    """Runs a model over a recording into a folder. The same settings on the same recording go on where they stopped."""
+
+    def __init__(
+        self, model: StereoToPose, recording: Recording, output: Path, settings: Mapping[str, Any], version: str
+    ):
+        self.model, self.recording, self.output = model, recording, output
+        self.settings, self.version = settings, version
+        self.parts = output / "parts"
+        self.problems: list[str] = []
+
+    def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
+        """Recover all poses and write `poses.csv`, `poses.npz`, `overlay.mp4`, `angles.png` and `summary.json`.
+
+        Returns the summary. `fresh` forgets what an interrupted run left.
+        """
+        begin, count = time.perf_counter(), min(len(self.recording), max_frames or len(self.recording))
+        done = self._resume(fresh)
+        if done < count:
+            self.model.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
+            self._follow(done, count)
+        sequence, labelled = self._collect()
+        with self.model.stopwatch.measure("export"):
+            write_poses_csv(self.output / "poses.csv", sequence)
+            write_poses_npz(self.output / "poses.npz", sequence)
+            plot_angles(self.output / "angles.png", sequence)
+            self._draw(sequence, labelled)
+        summary = self._summary(sequence, time.perf_counter() - begin, count - done)
+        write_summary(self.output / "summary.json", summary)
+        shutil.rmtree(self.parts)
+        return summary
+
+    def _resume(self, fresh: bool) -> int:
+        """How many frames the parts of an interrupted run hold; they are removed if they are not ours."""
+        key = hashlib.sha256(json.dumps([self.settings, self.version], sort_keys=True, default=str).encode()).hexdigest()
+        stamp = self.parts / "settings.txt"
+        if fresh or not stamp.is_file() or stamp.read_text() != key:
+            shutil.rmtree(self.parts, ignore_errors=True)
+            with replacing(stamp) as partial:
+                partial.write_text(key)
+            return 0
+        files = self._files()
+        if not files:
+            return 0
+        state = np.load(files[-1].with_name(files[-1].name.replace("poses", "state")))
+        self.model.tracker.restore({name: torch.from_numpy(state[name]) for name in state.files if name != "size"})
+        self.model.size = torch.from_numpy(state["size"]).to(self.model.device)
+        return sum(len(read_poses_npz(file)) for file in files)
+
+    def _files(self) -> list[Path]:
+        return sorted(self.parts.glob("poses_*.npz"))
+
+    def _follow(self, done: int, count: int) -> None:
+        """Frames `done` to `count`, saved every `PART` of them."""
+        waiting: list[FramePose] = []
+        with tqdm(total=count, initial=done, unit="frame", disable=not sys.stderr.isatty(), leave=False) as bar:
+            for position in range(done, count):
+                result = self.model.step(self.recording, position)
+                if result.problem:
+                    self.problems.append(f"frame {result.index}: {result.problem}")
+                waiting.append(result)
+                bar.set_postfix_str(result.status.value)
+                bar.update()
+                if len(waiting) == PART or position == count - 1:
+                    self._save(position + 1, waiting)
+                    waiting = []
+
+    def _save(self, end: int, frames: list[FramePose]) -> None:
+        """One part: poses, labelled points, and last what the next frame starts from."""
+        num = max((f.sight.cloud.mask.shape[1] for f in frames if f.sight is not None), default=1)
+        pixels, labels = np.full((len(frames), num, 2), np.nan, np.float32), np.full((len(frames), num), -1, np.int8)
+        for i, frame in enumerate(frames):
+            if frame.sight is not None and frame.registration is not None:
+                seen = frame.sight.cloud.mask[0].cpu()
+                pixels[i, seen] = frame.sight.cloud.pixels[0].cpu()[seen]
+                labels[i, seen] = frame.registration.belief[0].argmax(0).cpu()[seen]
+        with replacing(self.parts / f"points_{end:08d}.npz") as partial:
+            np.savez(partial, pixels=pixels, labels=labels)
+        state = {name: value.cpu().numpy() for name, value in self.model.tracker.state().items()}
+        with replacing(self.parts / f"state_{end:08d}.npz") as partial:
+            np.savez(partial, allow_pickle=False, size=self.model.size.cpu().numpy(), **state)
+        write_poses_npz(self.parts / f"poses_{end:08d}.npz", self.model.sequence(frames))
+
+    def _collect(self) -> tuple[PoseSequence, _Labelled]:
+        files = self._files()
+        sequence = PoseSequence.join([read_poses_npz(file) for file in files])
+        points = [np.load(file.with_name(file.name.replace("poses", "points"))) for file in files]
+        pixels, labels = (np.concatenate([part[name] for part in points]) for name in ("pixels", "labels"))
+        return sequence, _Labelled(torch.from_numpy(pixels), torch.from_numpy(labels).long())
+
+    def _draw(self, sequence: PoseSequence, labelled: _Labelled) -> None:
+        """The overlay video, from the recording's images and the poses."""
+        camera, body, size = self.model.camera, self.model.body, self.model.size
+        assert sequence.pose is not None
+        shown = [sequence.angle_names.index(name) for name in _SHOWN]
+        with open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate) as video:
+            for i in range(len(sequence)):
+                image = self._image(i)
+                overlay = Overlay(sequence.status[i])
+                if bool(sequence.pose[i].isfinite().all()):
+                    posed = body(sequence.pose[i : i + 1].to(size), size)
+                    angles = sequence.angles[i, shown].rad2deg().round().int().tolist()
+                    lines = (f"elbow L {angles[0]}  R {angles[1]}", f"knee  L {angles[2]}  R {angles[3]}")
+                    overlay = Overlay(
+                        sequence.status[i],
+                        camera.project(outline(posed))[0].cpu(),
+                        camera.project(posed.joints)[0].cpu(),
+                        labelled.pixels[i],
+                        labelled.labels[i],
+                        lines,
+                    )
+                video.write(draw_overlay(image, overlay))
+
+    def _image(self, position: int) -> Float[Tensor, "3 height width"]:
+        """What a person sees of a frame: its left image, its depth as grey, or black where it cannot be read."""
+        camera = self.model.camera
+        try:
+            frame = self.recording[position]
+        except UnreadableFrame:
+            return torch.zeros(3, camera.height, camera.width)
+        if frame.left is not None:
+            return frame.left
+        assert frame.depth is not None
+        near = (1 / frame.depth.clamp_min(0.5)).nan_to_num(0.0).clamp(0, 2) / 2
+        return near.expand(3, -1, -1)
+
+    def _summary(self, sequence: PoseSequence, seconds: float, frames: int) -> dict[str, Any]:
+        counts = Counter(sequence.status)
+        lengths = dict(zip(self.model.body.size_names, self.model.size[0].tolist(), strict=True))
+        stages = self.model.stopwatch.seconds
+        return {
+            "version": self.version,
+            "versions": {"torch": torch.__version__, "numpy": np.__version__, "python": sys.version.split()[0]},
+            "settings": self.settings,
+            "frames": len(sequence),
+            "status": dict(counts),
+            "answered": float(np.mean(sequence.answered)) if len(sequence) else 0.0,
+            "point_to_model_m": {
+                "mean": float(sequence.point_to_model.nanmean()),
+                "sd": float(np.nanstd(sequence.point_to_model.numpy())) if any(sequence.answered) else float("nan"),
+            },
+            "size": lengths,
+            "seconds": seconds,
+            "seconds_per_frame": seconds / max(frames, 1),
+            "cpu_ms_per_frame": {name: 1000 * value / max(frames, 1) for name, value in stages.items()},
+            "problems": self.problems,
+        }
+
+
+def summary_table(summary: Mapping[str, Any], output: Path) -> str:
+    """What a person wants to know at the end, in a few lines."""
+    status = ", ".join(f"{count} {name}" for name, count in summary["status"].items())
+    distance = summary["point_to_model_m"]["mean"]
+    lines = [
+        f"frames            {summary['frames']}: {status}",
+        f"answered          {100 * summary['answered']:.1f} %",
+        f"point to model    {1000 * distance:.1f} mm",
+        f"time              {summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame",
+        "CPU ms a frame    " + ", ".join(f"{name} {ms:.0f}" for name, ms in summary["cpu_ms_per_frame"].items()),
+        f"results           {output}/ poses.csv, poses.npz, overlay.mp4, angles.png, summary.json",
+    ]
+    problems = summary["problems"]
+    lines += [f"problem           {problem}" for problem in problems[:5]]
+    if len(problems) > 5:
+        lines.append(f"                  and {len(problems) - 5} more, see summary.json")
+    return "\n".join(lines)
+
+
+def settings_of(config: Any) -> dict[str, Any]:
+    """A configuration as plain data, for a summary and for recognising the same run again."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=lambda value: getattr(value, "value", str(value))))
