@@ -183,7 +183,7 @@ def test_depth_out_of_the_person_s_range_goes_and_the_background_s_too():
     depth[0, person], depth[0, far] = 2.0, 0.5
     colour_only = person_silhouette(log_odds, nothing(log_odds)).mask[0]
     assert same(colour_only, person | shadow | far, corners=8)
-    found = person_silhouette(log_odds, depth, background_depth=background).mask[0]
+    found = person_silhouette(log_odds, depth, SilhouetteConfig(depth_noise=0.003), background).mask[0]
     assert found[person].float().mean() > 0.99
     # Where depth changes it is not trusted, so a seam of two pixels stays of what touches the person.
     assert not (found & ~dilation_of(person, 2)).any()
@@ -303,6 +303,18 @@ def test_depth_background_tells_the_person_and_its_noise_grows():
     assert change[near] > 2 > 0 > change[far]  # 0.1 m before the wall is much at 1 m and noise at 6 m
 
 
+def test_depth_background_measures_a_worse_camera():
+    """Noise of four times what is assumed, and a corner that is worse yet: neither is anybody."""
+    wall = torch.full(SIZE, 4.0)
+    sigma = torch.where(rectangle(0, 0, 40, 60), 0.5, 4 * DepthBackgroundConfig().noise_growth * 16)
+    frames = wall + sigma * torch.randn(8, *SIZE)
+    measured, assumed = DepthBackground(frames[:5]), DepthBackground(frames[:1])
+    assert (measured(frames[5:]) > 0).float().mean() < 0.01
+    assert (assumed(frames[5:]) > 0).float().mean() > 0.1
+    assert (measured.sigma[5:35, 5:55] > 0.5).all()
+    assert (measured(frames[5:] - 2.5)[:, ~rectangle(0, 0, 40, 60)] > 0).float().mean() > 0.98
+
+
 def test_noise_line_measures_a_known_noise():
     level = torch.linspace(0.2, 0.8, 160).expand(3, *SIZE).double()
     variance = 1e-4 + 2e-4 * level
@@ -310,6 +322,12 @@ def test_noise_line_measures_a_known_noise():
     frames[3, :, :20, :20] = 0.9  # a passer-by
     offset, slope = noise_line(frames)
     assert_close(offset + slope * level, variance, rtol=0.1, atol=0)
+    level[:, 60:, :40] = 0.95  # brighter than all else, and flickering
+    frames[:, :, 60:, :40] = 0.95 + 0.3 * torch.randn(6, 1, 1, 1, dtype=torch.float64)
+    offset, slope = noise_line(frames)
+    calm = level < 0.9
+    ratio = ((offset + slope * level) / variance)[calm]
+    assert (ratio < 3).all()  # of the variance of the calm, where the screen's is 300 times as much
     one = noise_line(frames[:1])
     assert_close(one[0] + one[1] * level, variance, rtol=0.35, atol=0)  # the calmest blocks are calmer
 

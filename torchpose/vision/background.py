@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchpose.vision.camera import StereoCamera
-from torchpose.vision.photometry import noise_line, relative_gain, temporal_median
+from torchpose.vision.photometry import gradient_squared, noise_line, relative_gain, temporal_median
 from torchpose.vision.windows import window_max, window_mean, window_min
 
 Frames = Float[Tensor, "frames 3 height width"]
@@ -69,9 +69,7 @@ class BackgroundModel(nn.Module):
         """Learn from K frames (K, 3, H, W) of the empty scene; one will do, two measure the noise better."""
         super().__init__()
         if frames.shape[0] == 0:
-            raise ValueError(
-                "the background needs at least 1 frame, got 0; use BackgroundModel.from_recording"
-            )
+            raise ValueError("the background needs at least 1 frame, got 0; use `from_recording`")
         if not bool(torch.isfinite(frames).all()) or frames.min() < 0 or frames.max() > 1:
             raise ValueError("background frames must be finite and in [0, 1]; divide 8-bit images by 255")
         self.config = config
@@ -84,7 +82,7 @@ class BackgroundModel(nn.Module):
         if count >= 5:  # enough to see a pixel flicker: a screen, a leaf, or a person who stood there
             spread = window_mean((1.4826 * (frames - center).abs().median(0).values).square(), 1)
             level = level + (spread - 4 * level).clamp_min(0)
-        edges = _gradient_squared(center)
+        edges = gradient_squared(center)
         variance = (
             level * (1 + 1 / count) + config.jitter**2 * edges + (config.gain_tolerance * center).square()
         )
@@ -145,7 +143,7 @@ class BackgroundModel(nn.Module):
 
 @dataclass(frozen=True)
 class DepthBackgroundConfig:
-    """Settings of `DepthBackground`; noise is noise_floor + noise_growth Z^2."""
+    """Settings of `DepthBackground`; noise is noise_floor + noise_growth Z^2, or what is measured."""
 
     noise_floor: float = 0.02  # m
     noise_growth: float = 0.003  # m per m^2: 3 cm at 3 m
@@ -154,10 +152,8 @@ class DepthBackgroundConfig:
 
     def __post_init__(self) -> None:
         if not (self.noise_floor > 0 and self.noise_growth >= 0):
-            raise ValueError(
-                f"noise_floor must be positive and noise_growth not negative, got {self.noise_floor} and "
-                f"{self.noise_growth}"
-            )
+            noise = f"{self.noise_floor} and {self.noise_growth}"
+            raise ValueError(f"noise_floor must be positive and noise_growth not negative, got {noise}")
         if not 0 < self.outliers < 1:
             raise ValueError(f"outliers must be in (0, 1), got {self.outliers}")
         if not self.max_depth > 0:
@@ -165,9 +161,14 @@ class DepthBackgroundConfig:
 
 
 class DepthBackground(nn.Module):
-    """Foreground log-odds of a depth camera from the empty scene's depth; the noise grows as Z^2."""
+    """Foreground log-odds of a depth camera from the empty scene's depth; the noise grows as Z^2.
+
+    From three frames on the noise is measured too, its growth and where it is worse; twice what they show,
+    for a minute's drift is more than what successive frames differ by.
+    """
 
     depth: Plane  # m, NaN where the empty scene gave no reading
+    sigma: Plane  # m, standard deviation of a reading from it
 
     def __init__(
         self,
@@ -179,9 +180,17 @@ class DepthBackground(nn.Module):
         if frames.shape[0] == 0:
             raise ValueError("the background needs at least 1 depth frame, got 0; record the empty scene")
         self.config = config
-        self.register_buffer(
-            "depth", _clean_depth(frames, config.max_depth).nanmedian(0).values, persistent=False
-        )
+        frames = _clean_depth(frames, config.max_depth)
+        depth = frames.nanmedian(0).values
+        growth, spread = torch.full_like(depth[0, 0], config.noise_growth), torch.zeros_like(depth)
+        if len(frames) >= 3:
+            deviation = 1.4826 * (frames - depth).abs()
+            measured = (deviation / depth.square()).nanmedian()
+            growth = torch.where(measured > 0, (2 * measured).clamp_min(config.noise_growth), growth)
+            spread = 2 * window_mean(deviation.nanmedian(0).values.nan_to_num().square(), 2).sqrt()
+        self.register_buffer("depth", depth, persistent=False)
+        sigma = config.noise_floor + torch.maximum(growth * depth.square(), spread)
+        self.register_buffer("sigma", sigma, persistent=False)
 
     def forward(self, depth: Planes) -> Planes:
         """Log-odds in [-4, 4] of frames in metres: 0 without a reading, 1 if only the background has none."""
@@ -191,10 +200,9 @@ class DepthBackground(nn.Module):
                 f"got {tuple(depth.shape[-2:])}; record the background with the same camera"
             )
         depth, config = _clean_depth(depth, self.config.max_depth), self.config
-        sigma = config.noise_floor + config.noise_growth * self.depth.square()
         outlier = config.outliers / config.max_depth
         foreground = torch.where(depth < self.depth, (1 - config.outliers) / self.depth, 0) + outlier
-        background = (1 - config.outliers) * _normal(depth - self.depth, sigma) + outlier
+        background = (1 - config.outliers) * _normal(depth - self.depth, self.sigma) + outlier
         log_odds = torch.where(self.depth.isnan(), 1, torch.log(foreground / background).clamp(-4, 4))
         return torch.where(depth.isnan(), 0, log_odds)
 
@@ -213,14 +221,14 @@ class SilhouetteConfig:
     search_threshold: float = -3.0  # log-odds above which a pixel is searched: unchanged ones are not
     search_margin: int = 4  # px added around
     depth_range: float = 1.0  # m, the person's depth to either side of the middle
-    depth_noise: float = 0.003  # m per m^2 of depth, where no stereo camera is given
+    depth_noise: float = 0.006  # m per m^2 of depth, where no stereo camera is given
     disparity_noise: float = 0.25  # px, of a stereo camera
     noise_floor: float = 0.02  # m
     depth_weight: float = 3.0  # greatest log-odds that depth gives for or against a pixel
     agreement: int = 2  # px, depth counts where it says the same all around: edges are fattened
     bridge: int = 2  # px, parts apart by up to twice this belong together
     max_hole: float = 0.002  # share of the person; larger holes stay if the background is seen through them
-    min_area: float = 0.004  # share of the image below which there is no person
+    min_area: float = 0.008  # share of the image below which there is no person
 
     def __post_init__(self) -> None:
         for name in ("depth_range", "depth_noise", "disparity_noise", "noise_floor"):
@@ -378,13 +386,6 @@ def _largest_part(
     filled = inside & ((area <= max_hole * areas.max()) | (total > -2.5 * area))
     filled[0] = True  # label 0 of the holes is the person
     return torch.from_numpy(filled[holes]).to(mask.device)
-
-
-def _gradient_squared(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
-    padded = F.pad(image[None], (1, 1, 1, 1), mode="replicate")[0]
-    across = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
-    down = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
-    return 0.25 * (across.square() + down.square())
 
 
 def _clean_depth(

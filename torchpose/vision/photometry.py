@@ -84,3 +84,11 @@ def temporal_median(frames: Float[Tensor, "frames 3 height width"]) -> Float[Ten
     """Median over frames, the mean of the middle two where their number is even."""
     ordered = frames.sort(0).values
     return 0.5 * (ordered[(len(frames) - 1) // 2] + ordered[len(frames) // 2])
+
+
+def gradient_squared(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
+    """Square of the slope (per px) of each channel, by central differences."""
+    padded = F.pad(image[None], (1, 1, 1, 1), mode="replicate")[0]
+    across = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
+    down = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
+    return 0.25 * (across.square() + down.square())
