@@ -1,12 +1,13 @@
 """Accuracy and speed of `infer.py` on recordings with true joints.
 
-python -m benchmarks.people ../shared/data/people [--json FILE] [--oracle disparity mask ...] [--frames N] [key=value ...]
+python -m benchmarks.people ../shared/data/people [--json FILE] [--oracle STAGE ...] [--frames N] [key=value ...]
 
-Limb angles (degrees) and joints (mm) follow DESIGN.md's definitions on both sides; `within` is the share of the twelve
-limb joints within 10 cm, `unanswered` the share of frames without a pose. Errors are over the answered frames. Times are
-CPU milliseconds a frame on one thread. An oracle puts the truth in the place of one stage, which tells what that stage
-costs: `disparity` the true depth, `mask` the true silhouette, `labels` the true body parts, `start` the true pose before
-the first frame, `size` the true lengths of the limbs. Settings are those of infer.py.
+Limb angles (degrees) and joints (mm) follow DESIGN.md's definitions on both sides; `within` is the share of
+the twelve limb joints within 10 cm, `unanswered` the share of frames without a pose. Errors are over the
+answered frames. Times are CPU milliseconds a frame on one thread. An oracle puts the truth in the place of one
+stage, which tells what that stage costs: `disparity` the true depth, `mask` the true silhouette, `labels` the
+true body parts, `start` the true pose before the first frame, `size` the true lengths of the limbs. Settings
+are those of infer.py.
 """
 
 import argparse
@@ -33,7 +34,9 @@ from torchpose.vision.points import sample_grid
 ORACLES = ("disparity", "mask", "labels", "start", "size")
 KINDS = ("elbow", "knee", "shoulder", "hip")
 # Our limb joints, left before right, and the truth's names for them.
-LIMB_JOINTS = [f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR"]
+LIMB_JOINTS = [
+    f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR"
+]
 # The truth's body parts as segments of ours; neck, chest and pelvis are its own.
 SEGMENT_OF_PART = {"head": "head", "neck": "torso", "chest": "torso", "pelvis": "torso"} | {
     f"{part}_{side[0].upper()}": f"{part}_{side}"
@@ -83,8 +86,19 @@ class OracleEyes(Eyes):
         true_mask = torch.from_numpy(self.truth.labels(frame.index) > 0)[None]
         depth = self.truth.depth(frame.index) if "disparity" in self.oracles else sight.depth
         mask = true_mask if "mask" in self.oracles else sight.silhouette
-        cloud = sample_grid(depth, mask & true_mask if "disparity" in self.oracles else mask, self.camera, self.config.sampling)
-        return replace(sight, depth=depth, silhouette=mask, cloud=cloud, present=bool(cloud.mask.sum() >= self.config.min_points))
+        cloud = sample_grid(
+            depth,
+            mask & true_mask if "disparity" in self.oracles else mask,
+            self.camera,
+            self.config.sampling,
+        )
+        return replace(
+            sight,
+            depth=depth,
+            silhouette=mask,
+            cloud=cloud,
+            present=bool(cloud.mask.sum() >= self.config.min_points),
+        )
 
 
 class TrueLabels(PartLikelihood):
@@ -93,7 +107,9 @@ class TrueLabels(PartLikelihood):
     def __init__(self, segment_names: Sequence[str], truth: Truth, certainty: float = 8.0):
         super().__init__(segment_names)
         self.truth, self.certainty, self.index = truth, certainty, 0
-        table = [self.segment_names.index(SEGMENT_OF_PART[p]) if p in SEGMENT_OF_PART else -1 for p in truth.parts]
+        table = [
+            self.segment_names.index(SEGMENT_OF_PART[p]) if p in SEGMENT_OF_PART else -1 for p in truth.parts
+        ]
         self.segment_of_part = torch.tensor(table)
 
     def forward(self, evidence: Evidence) -> Float[Tensor, "batch num parts"]:
@@ -141,7 +157,8 @@ def true_size(body: BodyModel, truth: Truth) -> Float[Tensor, "1 sizes"]:
     for name, pair in pairs.items():
         if pair is None:
             true, own = (
-                ((j["shoulder_L"] + j["shoulder_R"]) / 2 - (j["hip_L"] + j["hip_R"]) / 2).norm() for j in (at, ours)
+                ((j["shoulder_L"] + j["shoulder_R"]) / 2 - (j["hip_L"] + j["hip_R"]) / 2).norm()
+                for j in (at, ours)
             )
         else:
             true, own = ((j[pair[0]] - j[pair[1]]).norm() for j in (at, ours))
@@ -149,7 +166,9 @@ def true_size(body: BodyModel, truth: Truth) -> Float[Tensor, "1 sizes"]:
     return size
 
 
-def measure(folder: Path, config: InferConfig, oracles: Sequence[str], frames: int | None) -> dict[str, float]:
+def measure(
+    folder: Path, config: InferConfig, oracles: Sequence[str], frames: int | None
+) -> dict[str, float]:
     """Figures of one recording."""
     recording, truth = open_recording(folder), Truth(folder)
     model = StereoToPose(recording.camera, config.eyes, config.pose)
@@ -179,7 +198,9 @@ def measure(folder: Path, config: InferConfig, oracles: Sequence[str], frames: i
     ours, true = sequence.joints[answered], truth.joints[index][answered]
     gap = (ours[:, 3:] - true).norm(dim=-1)
     # limb_angles reads the twelve limb joints alone; the first three stand in for none of them.
-    error = (limb_angles(ours) - limb_angles(torch.cat([torch.zeros_like(true[:, :3]), true], 1))).abs().rad2deg()
+    error = (
+        (limb_angles(ours) - limb_angles(torch.cat([torch.zeros_like(true[:, :3]), true], 1))).abs().rad2deg()
+    )
     figures = {f"{kind}_deg": float(error[:, 2 * i : 2 * i + 2].mean()) for i, kind in enumerate(KINDS)}
     figures |= {
         "angle_deg": float(error.mean()),
@@ -199,7 +220,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("people", type=Path, help="folder of recordings, each with a truth/ folder")
     parser.add_argument("settings", nargs="*", help="settings of infer.py, key=value")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
-    parser.add_argument("--oracle", nargs="+", choices=ORACLES, default=[], help="stages that the truth replaces")
+    parser.add_argument(
+        "--oracle", nargs="+", choices=ORACLES, default=[], help="stages that the truth replaces"
+    )
     parser.add_argument("--frames", type=int, help="only the first frames of each recording")
     parser.add_argument("--only", help="only recordings whose name contains this")
     arguments = parser.parse_intermixed_args(argv)
@@ -218,17 +241,25 @@ def main(argv: Sequence[str] | None = None) -> None:
             print(_row("recording", {name: name for name in table[folder.name]}))
         print(_row(folder.name, table[folder.name]), flush=True)
     stages = list(dict.fromkeys(name for figures in table.values() for name in figures))
-    table["overall"] = {name: float(np.nanmean([row.get(name, np.nan) for row in table.values()])) for name in stages}
+    table["overall"] = {
+        name: float(np.nanmean([row.get(name, np.nan) for row in table.values()])) for name in stages
+    }
     print(_row("overall", table["overall"]))
     if arguments.json:
-        arguments.json.write_text(json.dumps({"settings": arguments.settings, "oracle": arguments.oracle, "table": table}))
+        arguments.json.write_text(
+            json.dumps({"settings": arguments.settings, "oracle": arguments.oracle, "table": table})
+        )
 
 
 def _row(name: str, figures: dict) -> str:
     cells = []
     for column, value in figures.items():
         width = max(7, len(column) - 3)
-        text = column.removesuffix("_deg").removesuffix("_ms") if isinstance(value, str) else f"{value:.{_digits(column)}f}"
+        text = (
+            column.removesuffix("_deg").removesuffix("_ms")
+            if isinstance(value, str)
+            else f"{value:.{_digits(column)}f}"
+        )
         cells.append(f"{text:>{width}}")
     return f"{name:<22}" + " ".join(cells)
 

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "torchpose"
 # may import one another, also those that the design names and that are still to come. A new file takes its
 # place here first.
 ROOMS: dict[str, tuple[str, ...]] = {
-    "the ground": ("atomic", "settings", "geometry", "least_squares"),
+    "the ground": ("version", "atomic", "settings", "geometry", "least_squares"),
     "vision": (
         "camera",
         "windows",

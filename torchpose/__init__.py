@@ -1,7 +1,5 @@
 """torchpose: markerless joint angles and activities of a person from a stereo or depth camera, as tensor programs."""
 
-__version__ = "0.1.0"
-
 from torchpose.activity.dataset import Clip, read_skeletons
 from torchpose.activity.recognizer import Recognizer, RecognizerConfig
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, limb_angles
@@ -15,6 +13,7 @@ from torchpose.registration.likelihood import Evidence, PartLikelihood
 from torchpose.registration.vem import Observation, Registrar, RegistrationConfig
 from torchpose.rendered import demo_recording
 from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
+from torchpose.version import __version__
 from torchpose.vision.background import BackgroundModel, DepthBackground, person_silhouette
 from torchpose.vision.camera import RawStereo, StereoCamera
 from torchpose.vision.faces import FaceDetector, Faces
@@ -55,6 +54,7 @@ __all__ = [
     "TrackStatus",
     "Tracker",
     "TrackingConfig",
+    "__version__",
     "algebraic_distance",
     "anatomical_angles",
     "demo_recording",

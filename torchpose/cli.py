@@ -9,12 +9,12 @@ from typing import Any, Literal, overload
 
 import torch
 
-from torchpose import __version__
 from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
 from torchpose.session import Session, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups, describe
+from torchpose.version import __version__
 
 PACKAGE = Path(__file__).resolve().parent
 # Inside the wheel, or beside the package in a checkout.

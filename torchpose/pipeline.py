@@ -24,7 +24,6 @@ from torchpose.registration.likelihood import (
     AppearanceConfig,
     Evidence,
     FaceLikelihood,
-    PartLikelihood,
     TorsoLikelihood,
     appearance_potential,
 )
@@ -65,7 +64,9 @@ class EyesConfig:
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest < self.farthest:
-            raise ValueError(f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}")
+            raise ValueError(
+                f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}"
+            )
         if self.background_frames < 1 or self.min_points < 1:
             raise ValueError("background_frames and min_points must be at least 1")
 
@@ -147,7 +148,9 @@ class Eyes(nn.Module):
             self.background = BackgroundModel(left, self.config.background)
         else:
             frames = list(_readable(recording, spread))
-            left, right = (_stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right"))
+            left, right = (
+                _stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right")
+            )
             self.background = BackgroundModel.from_recording(left, self.config.background)
             left, right = left.median(0, keepdim=True).values, right.median(0, keepdim=True).values
         with self.stopwatch.measure("background"):
@@ -157,14 +160,17 @@ class Eyes(nn.Module):
     def forward(self, frame: Frame, device: torch.device) -> Sight:
         """Look at one frame."""
         if self.background is None:
-            raise ValueError("the background must be learned before a frame is looked at; call learn_background")
+            raise ValueError(
+                "the background must be learned before a frame is looked at; call learn_background"
+            )
         if frame.depth is not None:
             depth = frame.depth[None].to(device)
             images = frame.left[None].to(device) if frame.left is not None else _grey(depth)
             with self.stopwatch.measure("background"):
                 log_odds = self.background(depth)
         else:
-            assert frame.left is not None and frame.right is not None
+            assert frame.left is not None
+            assert frame.right is not None
             images, right = frame.left[None].to(device), frame.right[None].to(device)
             with self.stopwatch.measure("background"):
                 log_odds = self.background(images)
@@ -202,14 +208,16 @@ class StereoToPose(nn.Module):
     `likelihoods` are the appearance terms; a learned one is added to this list.
     """
 
-    def __init__(self, camera: StereoCamera, eyes: EyesConfig = EyesConfig(), config: PoseConfig = PoseConfig()):
+    def __init__(
+        self, camera: StereoCamera, eyes: EyesConfig = EyesConfig(), config: PoseConfig = PoseConfig()
+    ):
         super().__init__()
         self.camera = camera
         self.config = config
         self.eyes = Eyes(camera, eyes)
         self.body = BodyModel(config.body)
         names = self.body.segment_names
-        self.likelihoods: list[PartLikelihood] | nn.ModuleList = nn.ModuleList(
+        self.likelihoods = nn.ModuleList(
             [FaceLikelihood(names, config.appearance), TorsoLikelihood(names, config.appearance)]
         )
         registrar = Registrar(self.body, config.registration)
@@ -227,7 +235,7 @@ class StereoToPose(nn.Module):
     def observe(self, sight: Sight) -> Observation:
         """A sight as registration takes it."""
         evidence = Evidence(sight.images, sight.silhouette, sight.cloud, sight.faces)
-        potential = appearance_potential(list(self.likelihoods), evidence, self.body.num_parts)
+        potential = appearance_potential(self.likelihoods, evidence, self.body.num_parts)
         geodesic = None
         if self.config.registration.labelling.geodesic > 0:
             cells = group_cells(sight.cloud, self.config.cells)
@@ -359,7 +367,9 @@ def _readable(recording: Recording, positions: list[int]) -> Iterator[Frame]:
 def _stack(values: list[Tensor | None]) -> Tensor:
     there = [value for value in values if value is not None]
     if not there:
-        raise ValueError("the scene must be seen in at least one readable frame, got none; check the recording")
+        raise ValueError(
+            "the scene must be seen in at least one readable frame, got none; check the recording"
+        )
     return torch.stack(there)
 
 

@@ -51,7 +51,12 @@ class Session:
     """Runs a model over a recording into a folder. The same settings on the same recording go on where they stopped."""
 
     def __init__(
-        self, model: StereoToPose, recording: Recording, output: Path, settings: Mapping[str, Any], version: str
+        self,
+        model: StereoToPose,
+        recording: Recording,
+        output: Path,
+        settings: Mapping[str, Any],
+        version: str,
     ):
         self.model, self.recording, self.output = model, recording, output
         self.settings, self.version = settings, version
@@ -81,7 +86,9 @@ class Session:
 
     def _resume(self, fresh: bool) -> int:
         """How many frames the parts of an interrupted run hold; they are removed if they are not ours."""
-        key = hashlib.sha256(json.dumps([self.settings, self.version], sort_keys=True, default=str).encode()).hexdigest()
+        key = hashlib.sha256(
+            json.dumps([self.settings, self.version], sort_keys=True, default=str).encode()
+        ).hexdigest()
         stamp = self.parts / "settings.txt"
         if fresh or not stamp.is_file() or stamp.read_text() != key:
             shutil.rmtree(self.parts, ignore_errors=True)
@@ -92,7 +99,9 @@ class Session:
         if not files:
             return 0
         state = np.load(files[-1].with_name(files[-1].name.replace("poses", "state")))
-        self.model.tracker.restore({name: torch.from_numpy(state[name]) for name in state.files if name != "size"})
+        self.model.tracker.restore(
+            {name: torch.from_numpy(state[name]) for name in state.files if name != "size"}
+        )
         self.model.size = torch.from_numpy(state["size"]).to(self.model.device)
         return sum(len(read_poses_npz(file)) for file in files)
 
@@ -102,7 +111,9 @@ class Session:
     def _follow(self, done: int, count: int) -> None:
         """Frames `done` to `count`, saved every `PART` of them."""
         waiting: list[FramePose] = []
-        with tqdm(total=count, initial=done, unit="frame", disable=not sys.stderr.isatty(), leave=False) as bar:
+        with tqdm(
+            total=count, initial=done, unit="frame", disable=not sys.stderr.isatty(), leave=False
+        ) as bar:
             for position in range(done, count):
                 result = self.model.step(self.recording, position)
                 if result.problem:
@@ -117,7 +128,10 @@ class Session:
     def _save(self, end: int, frames: list[FramePose]) -> None:
         """One part: poses, labelled points, and last what the next frame starts from."""
         num = max((f.sight.cloud.mask.shape[1] for f in frames if f.sight is not None), default=1)
-        pixels, labels = np.full((len(frames), num, 2), np.nan, np.float32), np.full((len(frames), num), -1, np.int8)
+        pixels, labels = (
+            np.full((len(frames), num, 2), np.nan, np.float32),
+            np.full((len(frames), num), -1, np.int8),
+        )
         for i, frame in enumerate(frames):
             if frame.sight is not None and frame.registration is not None:
                 seen = frame.sight.cloud.mask[0].cpu()
@@ -179,14 +193,20 @@ class Session:
         stages = self.model.stopwatch.seconds
         return {
             "version": self.version,
-            "versions": {"torch": torch.__version__, "numpy": np.__version__, "python": sys.version.split()[0]},
+            "versions": {
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+                "python": sys.version.split()[0],
+            },
             "settings": self.settings,
             "frames": len(sequence),
             "status": dict(counts),
             "answered": float(np.mean(sequence.answered)) if len(sequence) else 0.0,
             "point_to_model_m": {
                 "mean": float(sequence.point_to_model.nanmean()),
-                "sd": float(np.nanstd(sequence.point_to_model.numpy())) if any(sequence.answered) else float("nan"),
+                "sd": float(np.nanstd(sequence.point_to_model.numpy()))
+                if any(sequence.answered)
+                else float("nan"),
             },
             "size": lengths,
             "seconds": seconds,
@@ -205,7 +225,8 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
         f"answered          {100 * summary['answered']:.1f} %",
         f"point to model    {1000 * distance:.1f} mm",
         f"time              {summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame",
-        "CPU ms a frame    " + ", ".join(f"{name} {ms:.0f}" for name, ms in summary["cpu_ms_per_frame"].items()),
+        "CPU ms a frame    "
+        + ", ".join(f"{name} {ms:.0f}" for name, ms in summary["cpu_ms_per_frame"].items()),
         f"results           {output}/ poses.csv, poses.npz, overlay.mp4, angles.png, summary.json",
     ]
     problems = summary["problems"]
@@ -217,4 +238,6 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
 
 def settings_of(config: Any) -> dict[str, Any]:
     """A configuration as plain data, for a summary and for recognising the same run again."""
-    return json.loads(json.dumps(dataclasses.asdict(config), default=lambda value: getattr(value, "value", str(value))))
+    return json.loads(
+        json.dumps(dataclasses.asdict(config), default=lambda value: getattr(value, "value", str(value)))
+    )

@@ -4,7 +4,7 @@ This is where a learned part likelihood plugs in: subclass `PartLikelihood`. Pix
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -99,7 +99,7 @@ class TorsoLikelihood(PartLikelihood):
 
 
 def appearance_potential(
-    likelihoods: Sequence[PartLikelihood], evidence: Evidence, num_parts: int
+    likelihoods: Iterable[nn.Module], evidence: Evidence, num_parts: int
 ) -> Float[Tensor, "batch num parts"]:
     """The sum of the terms' log-potentials, B x M x parts."""
     total = evidence.cloud.points.new_zeros(*evidence.cloud.mask.shape, num_parts)

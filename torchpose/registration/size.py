@@ -29,7 +29,9 @@ class SizeConfig:
 
     def __post_init__(self) -> None:
         if self.rounds < 0 or self.lm_steps < 1:
-            raise ValueError(f"rounds must not be negative and lm_steps at least 1, got {self.rounds}, {self.lm_steps}")
+            raise ValueError(
+                f"rounds must not be negative and lm_steps at least 1, got {self.rounds}, {self.lm_steps}"
+            )
         for name in ("common_length_sd", "length_sd", "common_girth_sd", "girth_sd"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -38,7 +40,9 @@ class SizeConfig:
 def stack_observations(observations: Sequence[Observation]) -> Observation:
     """Frames by the same camera as one batch."""
     clouds = [observation.cloud for observation in observations]
-    cloud = PointCloud(**{f.name: torch.cat([getattr(c, f.name) for c in clouds]) for f in fields(PointCloud)})
+    cloud = PointCloud(
+        **{f.name: torch.cat([getattr(c, f.name) for c in clouds]) for f in fields(PointCloud)}
+    )
     potential = torch.cat([observation.potential for observation in observations])
     nearest = torch.cat([observation.nearest for observation in observations])
     return Observation(cloud, potential, nearest, observations[0].camera)
@@ -92,7 +96,9 @@ class _JointProblem:
     registrar: Registrar
     rows: Rows
     prior: PosePrior
-    posed: PosedBody  # where the rows were made: a foot point keeps its place relative to the spheroid's radii
+    posed: (
+        PosedBody  # where the rows were made: a foot point keeps its place relative to the spheroid's radii
+    )
     mean: Tensor
     root: Tensor
 
@@ -104,8 +110,12 @@ class _JointProblem:
         body, fitting = self.registrar.body, self.registrar.config.fitting
         pose, size = self.split(unknowns)
         B, P = pose.shape
-        residual, by_pose = linearize_by_screws(body, size, self._resized(body(pose, size)), self.prior, fitting)(pose)
-        _, by_size = linearize_by_autograd(lambda sizes: self._row_residual(body(pose, sizes)))(size.repeat(B, 1))
+        residual, by_pose = linearize_by_screws(
+            body, size, self._resized(body(pose, size)), self.prior, fitting
+        )(pose)
+        _, by_size = linearize_by_autograd(lambda sizes: self._row_residual(body(pose, sizes)))(
+            size.repeat(B, 1)
+        )
         R, M = by_size.shape[1], residual.shape[1]
         jacobian = residual.new_zeros(B, M, B, P)
         frame = torch.arange(B)

@@ -87,7 +87,10 @@ class Starter(nn.Module):
         return found
 
     def refresh(
-        self, observation: Observation, pose: Float[Tensor, "1 parameters"], size: Float[Tensor, "#batch sizes"]
+        self,
+        observation: Observation,
+        pose: Float[Tensor, "1 parameters"],
+        size: Float[Tensor, "#batch sizes"],
     ) -> Registration:
         """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
         return self._search(observation, self.variations(pose), size, self.registrar.config.sigma_first)
@@ -147,7 +150,10 @@ class Starter(nn.Module):
         return self.body.pose_from_directions(root[:, :3], root[:, 3:6], directions)
 
     def _exchange(
-        self, pose: Float[Tensor, "starts parameters"], misfit: Float[Tensor, " starts"], limb: tuple[str, str]
+        self,
+        pose: Float[Tensor, "starts parameters"],
+        misfit: Float[Tensor, " starts"],
+        limb: tuple[str, str],
     ) -> Float[Tensor, "combinations parameters"]:
         """The best start with each left and each right limb of the eight best starts."""
         names = self.body.parameter_names
@@ -180,7 +186,9 @@ def pelvis_position(
     tops = torch.where(column, points[..., 1], nan)
     # A few stray points may stand above the head: the second hundredth is taken, not the least.
     top = torch.nanquantile(tops, 0.02, dim=1) + crown
-    head = torch.where(faces.found[:, None], faces.position, torch.stack([middle[:, 0], top, middle[:, 2]], -1))
+    head = torch.where(
+        faces.found[:, None], faces.position, torch.stack([middle[:, 0], top, middle[:, 2]], -1)
+    )
     y = head[:, 1] + down
     trunk = (points[..., 1] - (y - 0.2)[:, None]).abs() < 0.25
     x, z = (torch.where(trunk, points[..., i], nan).nanmedian(1).values for i in (0, 2))
@@ -193,13 +201,15 @@ def select(registration: Registration, row: Tensor) -> Registration:
     """One row of a registration, as a batch of 1."""
     picked = {name: getattr(registration, name) for name in Registration.__dataclass_fields__}
     bound = picked.pop("bound")
-    return Registration(**{name: value[row][None] for name, value in picked.items()}, bound=bound[:, row][:, None])
+    return Registration(
+        **{name: value[row][None] for name, value in picked.items()}, bound=bound[:, row][:, None]
+    )
 
 
 def _directions(
     arm: tuple[tuple[float, ...], tuple[float, ...]], leg: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> Float[Tensor, "limbs 3"]:
-    """Limb directions of a symmetric pose in the order of the body file: head, left and right arm, left and right leg."""
+    """Limb directions of a symmetric pose in the order of the body file: head, arms, legs, left before right."""
     mirror = torch.tensor([-1.0, 1.0, 1.0])
     arms, legs = torch.tensor(arm), torch.tensor(leg)
     head = torch.tensor([[0.0, -cos(0.1), -sin(0.1)]])

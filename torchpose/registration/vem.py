@@ -36,12 +36,18 @@ class RegistrationConfig:
     distance: Distance = Distance.euclidean
     visible: bool = True  # correspond with the side that the camera sees
     outlier: float = 3.0  # sigmas beyond which a point rather has no part; 0 gives every point a part
-    hard: bool = True  # each point answers to its best label alone; soft costs 14 times the rows and gains nothing
-    tangential: float = 0.3  # weight of the residual along the surface; 1 is the Euclidean distance to a fixed foot
+    hard: bool = (
+        True  # each point answers to its best label alone; soft costs 14 times the rows and gains nothing
+    )
+    tangential: float = (
+        0.3  # weight of the residual along the surface; 1 is the Euclidean distance to a fixed foot
+    )
     robust_sd: float = 0.05  # m, at which a residual loses three quarters of its weight; 0 weighs all alike
     noise_sd: float = 0.02  # m, of a point in the M-step
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
-    rest_sd: float = 0.5  # rad, of the pull towards the rest pose on joints that nothing is seen of; 0 is none
+    rest_sd: float = (
+        0.5  # rad, of the pull towards the rest pose on joints that nothing is seen of; 0 is none
+    )
     rest_support: float = 5.0  # points on a limb that halve this pull
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
@@ -70,7 +76,9 @@ class Observation:
 
     def expand(self, batch: int) -> "Observation":
         """The same observation for `batch` starts, without a copy."""
-        cloud = PointCloud(*(_rows(getattr(self.cloud, name), batch) for name in PointCloud.__dataclass_fields__))
+        cloud = PointCloud(
+            *(_rows(getattr(self.cloud, name), batch) for name in PointCloud.__dataclass_fields__)
+        )
         geodesic = self.geodesic
         if geodesic is not None:
             geodesic = GeodesicTerm(
@@ -88,8 +96,12 @@ class Registration:
     """The fitted poses and what speaks for them."""
 
     pose: Float[Tensor, "batch parameters"]
-    covariance: Float[Tensor, "batch parameters parameters"]  # of the pose, from rows, prior and limits (Laplace)
-    belief: Float[Tensor, "batch labels num"]  # q(label) of each point; the last label is "no part" where there is one
+    covariance: Float[
+        Tensor, "batch parameters parameters"
+    ]  # of the pose, from rows, prior and limits (Laplace)
+    belief: Float[
+        Tensor, "batch labels num"
+    ]  # q(label) of each point; the last label is "no part" where there is one
     distance: Float[Tensor, "batch num"]  # m, to the nearest part; 0 on padding
     point_to_model: Float[Tensor, " batch"]  # m, (5.2): the mean of `distance` over the points
     misfit: Float[Tensor, " batch"]  # m, capped distance of the points plus overhang: compares starts
@@ -194,7 +206,11 @@ class Registrar(nn.Module):
             wide = pick[..., None].expand(-1, -1, -1, 3)
             normal, residual, local = (x.gather(1, wide) for x in (normal, residual, local))
             target = target[:, :1]
-        frames = posed.frames.flatten(2).gather(1, part.flatten(1)[..., None].expand(-1, -1, 9)).unflatten(2, (3, 3))
+        frames = (
+            posed.frames.flatten(2)
+            .gather(1, part.flatten(1)[..., None].expand(-1, -1, 9))
+            .unflatten(2, (3, 3))
+        )
         normal = (frames @ normal.flatten(1, 2)[..., None])[..., 0]
         scale = weight.flatten(1).sqrt() / config.noise_sd
         # Along the normal the distance counts in full. Along the surface it does so only as far as asked, which lets

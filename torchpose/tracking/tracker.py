@@ -44,7 +44,14 @@ class TrackingConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.velocity <= 1:
             raise ValueError(f"velocity must be between 0 and 1, got {self.velocity}")
-        for name in ("joint_speed_sd", "root_speed_sd", "accept_misfit", "stray_distance", "stray_share", "memory"):
+        for name in (
+            "joint_speed_sd",
+            "root_speed_sd",
+            "accept_misfit",
+            "stray_distance",
+            "stray_share",
+            "memory",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 

@@ -70,7 +70,9 @@ class DisparitySpace:
         """The region of images (batch, height, width) of full size, as a view."""
         return images[:, self.top : self.top + self.height, self.left : self.left + self.width]
 
-    def pad(self, region: Float[Tensor, "batch h w"] | Bool[Tensor, "batch h w"], value: float | bool) -> Tensor:
+    def pad(
+        self, region: Float[Tensor, "batch h w"] | Bool[Tensor, "batch h w"], value: float | bool
+    ) -> Tensor:
         """The map of a region."""
         return F.pad(region, (REACH, REACH, 1, 1), value=value).flatten()
 
