@@ -1,7 +1,7 @@
-"""Distances from points to spheroids: nearest point (App. D), nearest visible point, algebraic distance (3.3).
+"""Distances of points to spheroids: nearest point (App. D), nearest visible point, algebraic distance (3.3).
 
-A spheroid is given by its centre, its frame (columns: axes, the long one last) and its radii (a, c), a <= c, in the
-camera's frame, metres. Every function returns all B x K x N pairs: parts before points.
+A spheroid is given by its centre, its frame (columns: axes, the long one last) and its radii (a, c), a <= c,
+in the camera's frame, metres. Every function returns all B x K x N pairs: parts before points.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,8 @@ from torch import Tensor
 
 from torchpose.body.model import PosedBody
 
-# Newton from below converges monotonically; 8 steps reach 2e-16 relative, measured over 1e6 spheroids and points.
+# Newton from below converges monotonically; 8 steps reach 2e-16 relative, measured over 1e6 spheroids and
+# points.
 NEWTON_STEPS = 8
 
 
@@ -36,7 +37,9 @@ def to_local(posed: PosedBody, points: Float[Tensor, "batch num 3"]) -> Float[Te
     return (points[:, None] - posed.centers[:, :, None]) @ posed.frames
 
 
-def to_camera(posed: PosedBody, local: Float[Tensor, "batch parts num 3"]) -> Float[Tensor, "batch parts num 3"]:
+def to_camera(
+    posed: PosedBody, local: Float[Tensor, "batch parts num 3"]
+) -> Float[Tensor, "batch parts num 3"]:
     """Points of the spheroids' frames in the camera's frame, m."""
     return local @ posed.frames.mT + posed.centers[:, :, None]
 
@@ -46,42 +49,43 @@ def nearest_point(
 ) -> Float[Tensor, "batch parts num 3"]:
     """The nearest point of the surface of each spheroid to each point, both in the spheroid's frame, m.
 
-    In the half plane of the point and the long axis it is the nearest point (u, v) of the ellipse to (r0, z0) (T. Fig.
-    3.5). With s = 1 + t/a^2, u = r0 / s and v = z0 / (1 + (a/c)^2 (s - 1)); s solves N(s) = (u/a)^2 + (v/c)^2 = 1.
-    Newton runs on 1/sqrt(N) - 1, which is concave and rising (a power mean of lines), from a lower bound of the root.
-    On the long axis the direction across is arbitrary, and at the centre any equator point is nearest: the first axis.
-    Gradients are exact: the last step is differentiable.
+    In the half plane of the point and the long axis it is the nearest point (u, v) of the ellipse to (r0, z)
+    (T. Fig. 3.5). With s = 1 + t/a^2, u = r0 / s and v = z / (1 + (a/c)^2 (s - 1)); s solves N(s) = (u/a)^2 +
+    (v/c)^2 = 1. Newton runs on 1/sqrt(N) - 1, concave and rising (a power mean of lines), from a lower bound
+    of the root. On the long axis the direction across is arbitrary, and at the centre any equator point is
+    nearest: the first axis. Gradients are exact: the last step is differentiable. There is none across the
+    long axis, where it is not defined.
     """
     a, c = radii[..., None, 0], radii[..., None, 1]
     x, y, z = local.unbind(-1)
-    across = torch.hypot(x, y)
+    # Keeps the root off s = 0. A point on the axis moves by 6e-6 of the radius (float32), its distance to the
+    # foot, which is stationary, by the square of that.
     tiny = torch.finfo(local.dtype).eps ** 0.75 * a
-    r0 = torch.maximum(across, tiny)  # keeps the root off s = 0; moves a point on the axis by 1e-6 of the radius
-    z0 = z.abs()
+    square = x * x + y * y
+    on_axis = square <= tiny * tiny
+    across = torch.where(on_axis, 1.0, square).sqrt()  # 1: the unused branch is differentiated too
+    r0 = torch.where(on_axis, tiny, across)
     flat = (a / c) ** 2
     slack = 1 - flat
 
     def newton(s: Tensor) -> Tensor:
         u, stretch = r0 / (a * s), slack + flat * s
-        v = z0 / (c * stretch)
+        v = z / (c * stretch)
         N = u * u + v * v
         slope = u * u / s + flat * v * v / stretch  # -N'/2
         return s + N * (N.sqrt() - 1) / slope
 
     with torch.no_grad():
-        s = torch.maximum(r0 / a, (z0 / c - slack) / flat)
+        s = torch.maximum(r0 / a, (z.abs() / c - slack) / flat)
         for _ in range(NEWTON_STEPS):
             s = newton(s)
     s = newton(s)
-    u, v = r0 / s, z0 / (slack + flat * s)
+    u, v = r0 / s, z / (slack + flat * s)
     # Rounding in s leaves the point off the surface by its relative error; one scaling puts it back on.
     scale = torch.rsqrt((u / a) ** 2 + (v / c) ** 2)
-    on_axis = across <= tiny
-    safe = torch.where(on_axis, 1.0, across)
-    ux = torch.where(on_axis, 1.0, x / safe)
-    uy = torch.where(on_axis, 0.0, y / safe)
-    u, v = u * scale, v * scale
-    return torch.stack([u * ux, u * uy, torch.where(z < 0, -v, v)], -1)
+    ux = torch.where(on_axis, 1.0, x / across)
+    uy = torch.where(on_axis, 0.0, y / across)
+    return torch.stack([u * scale * ux, u * scale * uy, v * scale], -1)
 
 
 def surface_normal(
@@ -95,48 +99,78 @@ def surface_normal(
 def foot_point(posed: PosedBody, points: Float[Tensor, "batch num 3"], visible: bool = True) -> FootPoint:
     """The nearest point of every spheroid, or with `visible` the nearest one that the camera can see.
 
-    A point behind the rim of a spheroid cannot have come from its far side. It is moved along its ray onto the plane of
-    the rim, and answered by the nearest surface point there; the residual keeps the way along the ray, so that the
-    distance stays continuous where a point crosses the rim (taking the ray's hit instead would make it jump).
+    A point whose nearest one faces away from the camera cannot have come from there. Of the visible side the
+    rim is then nearest (off the long axis the distance to a spheroid has no second minimum), so the distance
+    stays continuous where points cross over; taking the hit of the point's ray instead would make it jump.
     """
     local = to_local(posed, points)
     nearest = nearest_point(local, posed.radii)
-    a, c = posed.radii.unbind(-1)
-    extent = torch.stack([a, a, c], -1)[:, :, None]
-    camera = -(posed.centers[:, :, None] @ posed.frames) / extent  # (B, K, 1, 3), the spheroid being the unit ball
-    beyond = (camera * camera).sum(-1) > 1  # a camera inside a spheroid sees no rim
-    hidden = ((camera * nearest / extent).sum(-1) < 1) & beyond
+    camera = _camera(posed)
+    beyond = (camera * camera).sum(-1, keepdim=True) > 1  # a camera inside a spheroid sees no rim
+    hidden = ((nearest / _extent(posed)[:, :, None] * camera[:, :, None]).sum(-1) < 1) & beyond
     if visible:
-        unit = local / extent
-        ray = unit - camera
-        along = (1 - (camera * camera).sum(-1)) / (camera * ray).sum(-1).clamp_max(-1e-6)
-        behind = hidden & (along < 1)
-        rim = (camera + along.clamp(0, 1)[..., None] * ray) * extent
-        nearest = torch.where(behind[..., None], nearest_point(torch.where(behind[..., None], rim, local), posed.radii), nearest)
+        rim = _rim(posed)
+        flat = (local - rim.center[:, :, None]) @ rim.axes
+        # The rim is an ellipse, a slice of the spheroid of its two half axes: one solver serves both.
+        flat = torch.stack([flat[..., 0], torch.zeros_like(flat[..., 0]), flat[..., 1]], -1)
+        flat = nearest_point(flat, rim.radii)[..., ::2]
+        onto = rim.center[:, :, None] + flat @ rim.axes.mT
+        nearest = torch.where(hidden[..., None], onto, nearest)
     return FootPoint(nearest, surface_normal(nearest, posed.radii), local - nearest, hidden)
 
 
-def algebraic_distance(posed: PosedBody, points: Float[Tensor, "batch num 3"]) -> Float[Tensor, "batch parts num"]:
-    """q(X) of (3.3): 0 on the surface, no unit, and smaller towards the poles than the Euclidean distance."""
+@dataclass(frozen=True)
+class _Rim:
+    """Where the camera's rays touch each spheroid: an ellipse, in the spheroid's frame."""
+
+    center: Float[Tensor, "batch parts 3"]  # m
+    axes: Float[Tensor, "batch parts 3 2"]  # columns: unit directions of its short and its long half axis
+    radii: Float[Tensor, "batch parts 2"]  # m, short and long
+
+
+def _rim(posed: PosedBody) -> _Rim:
+    """With the spheroid as the unit ball and the camera at C, a circle of radius sqrt(1 - 1/C^2) about C/C^2.
+
+    Of its plane's directions the one across the long axis keeps its length and stays square to the other when
+    the ball is stretched back: these are the ellipse's axes.
+    """
+    extent, camera = _extent(posed), _camera(posed)
+    # The floor gives a camera inside a rim of no size.
+    square = (camera * camera).sum(-1, keepdim=True).clamp_min(1 + 1e-6)
+    x, y, z = camera.unbind(-1)
+    level = x * x + y * y
+    along_axis = level <= torch.finfo(level.dtype).eps ** 2 * square[..., 0]
+    safe = torch.where(along_axis, 1.0, level).sqrt()  # 1: the unused branch is differentiated too
+    first = torch.stack([torch.where(along_axis, 1.0, -y / safe), x / safe, torch.zeros_like(z)], -1)
+    second = torch.linalg.cross(torch.nn.functional.normalize(camera, dim=-1), first) * extent
+    radius = (1 - 1 / square).sqrt()
+    length = second.norm(dim=-1, keepdim=True)
+    radii = radius * torch.cat([extent[..., :1], length], -1)
+    return _Rim(camera / square * extent, torch.stack([first, second / length], -1), radii)
+
+
+def _extent(posed: PosedBody) -> Float[Tensor, "batch parts 3"]:
+    """Half axes along the columns of `frames`, m."""
     a, c = posed.radii.unbind(-1)
-    scaled = to_local(posed, points) / torch.stack([a, a, c], -1)[:, :, None]
+    return torch.stack([a, a, c], -1)
+
+
+def _camera(posed: PosedBody) -> Float[Tensor, "batch parts 3"]:
+    """Where the camera stands in the frame of each spheroid, stretched so that this is the unit ball."""
+    return -(posed.centers[:, :, None] @ posed.frames)[:, :, 0] / _extent(posed)
+
+
+def algebraic_distance(
+    posed: PosedBody, points: Float[Tensor, "batch num 3"]
+) -> Float[Tensor, "batch parts num"]:
+    """q(X) of (3.3): 0 on the surface, no unit, and smaller towards the poles than the Euclidean distance."""
+    scaled = to_local(posed, points) / _extent(posed)[:, :, None]
     return (scaled * scaled).sum(-1) - 1
 
 
 def outline(posed: PosedBody, num: int = 32) -> Float[Tensor, "batch parts num 3"]:
-    """Points on the rim of each spheroid, where the camera's rays touch it, m in the camera's frame.
-
-    With the spheroid as the unit ball and the camera at C, the rim is the circle of radius sqrt(1 - 1/C^2) about C/C^2.
-    """
-    a, c = posed.radii.unbind(-1)
-    extent = torch.stack([a, a, c], -1)
-    camera = -(posed.centers[:, :, None] @ posed.frames)[:, :, 0] / extent
-    square = (camera * camera).sum(-1, keepdim=True).clamp_min(1 + 1e-6)
-    toward = camera / square.sqrt()
-    least = torch.nn.functional.one_hot(toward.abs().argmin(-1), 3).to(toward)
-    first = torch.nn.functional.normalize(torch.linalg.cross(toward, least), dim=-1)
-    second = torch.linalg.cross(toward, first)
-    turn = torch.arange(num, dtype=camera.dtype, device=camera.device) * (2 * torch.pi / num)
-    circle = turn.cos()[:, None] * first[:, :, None] + turn.sin()[:, None] * second[:, :, None]
-    rim = (camera / square)[:, :, None] + (1 - 1 / square).sqrt()[:, :, None] * circle
-    return to_camera(posed, rim * extent[:, :, None])
+    """Points on the rim of each spheroid, where the camera's rays touch it, m in the camera's frame."""
+    rim = _rim(posed)
+    turn = torch.arange(num, dtype=rim.radii.dtype, device=rim.radii.device) * (2 * torch.pi / num)
+    circle = torch.stack([turn.cos(), turn.sin()], -1)  # (num, 2)
+    return to_camera(posed, rim.center[:, :, None] + (circle * rim.radii[:, :, None]) @ rim.axes.mT)

@@ -166,20 +166,19 @@ def _reading(entry: str) -> Iterator[None]:
         raise ValueError(f"{entry}: {error}") from error
 
 
-def _expand(data: dict[str, Any]) -> Skeleton:
+def _expand(data: Any) -> Skeleton:
     sizes = (*data["lengths"], *data["girths"])
     if len(set(sizes)) != len(sizes):
         raise ValueError(f"sizes must have different names, got {list(sizes)}")
 
-    def sized(entry: dict[str, Any]) -> SizedVector:
-        for name in entry:
-            if name not in data["lengths"]:
-                raise ValueError(f"a vector is given per length, one of {data['lengths']}, got {name!r}")
+    def sized(entry: Any) -> SizedVector:
+        if not isinstance(entry, dict) or not set(entry) <= set(data["lengths"]):
+            raise ValueError(f"a vector must be given per length, of {data['lengths']}, got {entry}")
         return SizedVector(tuple((name, _vector(value)) for name, value in entry.items()))
 
-    def measure(entry: dict[str, Any], kind: str) -> tuple[str, float]:
-        name, value = next(iter(entry.items()))
-        if len(entry) != 1 or name not in data[kind] or not 0 < float(value) < inf:
+    def measure(entry: Any, kind: str) -> tuple[str, float]:
+        name, value = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else ("", 0)
+        if name not in data[kind] or not 0 < float(value) < inf:
             raise ValueError(f"one of {data[kind]} must come with a positive value in metres, got {entry}")
         return name, float(value)
 
@@ -216,7 +215,7 @@ def _expand(data: dict[str, Any]) -> Skeleton:
     if unreached := set(data["bodies"]) - reached:
         raise ValueError(f"every body must hang from {roots[0]!r}, these do not: {sorted(unreached)}")
 
-    def sides(entry: dict[str, Any]) -> tuple[str, ...]:
+    def sides(entry: Any) -> tuple[str, ...]:
         sided = bool(entry.get("sided"))
         wanted = tuple(entry["body"] + side for side in (("_left", "_right") if sided else ("",)))
         if not set(wanted) <= set(names):
@@ -274,7 +273,7 @@ def _mirror(direction: Vector) -> Vector:
     return -direction[0], direction[1], direction[2]
 
 
-def _hinges(entry: dict[str, Any], center: Vector | None = None) -> Hinges:
+def _hinges(entry: Any, center: Vector | None = None) -> Hinges:
     one, two = (_unit(axis) for axis in entry["axes"])
     if center is not None:
         # A swing's axes lie across its centre, at right angles: made so here, for the reader's ease.
