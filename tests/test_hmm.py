@@ -370,6 +370,8 @@ def test_an_impossible_training_sequence_spoils_its_own_model_only():
     config = HMMConfig(1, **NO_SMOOTHING)
     fitted = baum_welch(start, symbols, torch.tensor([3, 3]), torch.tensor([0, 1]), config)
     assert fitted.status.tolist() == [Status.IMPOSSIBLE, Status.CONVERGED]
+    assert torch.isneginf(fitted.objective[:, 0]).all()
+    assert fitted.objective[:, 1].isfinite().all()
     assert_close(fitted.parameters.log_emission[1].exp(), torch.full((1, 3), 1 / 3).double())
     assert "model 0: impossible" in fitted.summary()
     smoothed = hmm_smoother(
@@ -389,8 +391,12 @@ def test_models_without_data_or_time_say_so():
 
 @pytest.mark.parametrize("config", [HMMConfig(), HMMConfig(**NO_SMOOTHING)], ids=["smoothed", "not smoothed"])
 def test_sequences_shorter_than_the_states_train(config):
-    symbols, lengths = torch.tensor([[3, 1, 0], [2, 0, 0]]), torch.tensor([2, 1])
-    hmm = DiscreteHMM(1, 4, config)
+    """In two frames a sequence gets no further than the second state, which must then know its symbol."""
+    symbols, lengths = (
+        torch.tensor([[0, 0, 1, 1, 2, 2, 3, 3], [0, 4, 0, 0, 0, 0, 0, 0]]),
+        torch.tensor([8, 2]),
+    )
+    hmm = DiscreteHMM(1, 5, config)
     fitted = hmm.fit(symbols, lengths, torch.tensor([0, 0]))
     assert fitted.status.tolist() == [Status.CONVERGED]
     assert hmm.log_likelihood(symbols, lengths).isfinite().all()

@@ -97,12 +97,11 @@ def kmeans(
 
 
 def _refill(points: Tensor, centers: Tensor, symbols: Tensor) -> Tensor:
-    """Give every centre without points one that lies far from its own, never one that lies upon it."""
+    """Give every centre without points one that lies far from its own."""
     empty = (symbols.bincount(minlength=len(centers)) == 0).nonzero().squeeze(1)
     if len(empty) == 0:
         return symbols
-    distance, farthest = _squared_distance(points, centers, symbols).topk(min(len(empty), len(points)))
-    farthest = farthest[distance > 0]
+    farthest = _squared_distance(points, centers, symbols).topk(min(len(empty), len(points))).indices
     return symbols.scatter(0, farthest, empty[: len(farthest)])
 
 
