@@ -84,7 +84,7 @@ def see(
     generator: torch.Generator | None = None,
     camera: StereoCamera = CAMERA,
 ) -> View:
-    """A view of one pose (1, P) with at most `num` points, whose depths have standard deviation `noise`, m."""
+    """A view of one pose (1, P) with at most `num` points; their depths are off by `noise` (sd, m)."""
     posed = body(pose, size)
     u, v = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
     pixels = torch.stack([u, v], -1).flatten(0, 1).to(pose)
@@ -123,11 +123,8 @@ def padded(values: Tensor, num: int, fill: float) -> Tensor:
 def grid_neighbours(grid: Int[Tensor, "count 2"], num: int, radius: float = 2.0) -> Int[Tensor, "1 num 12"]:
     """By comparing all pairs; `num` where there is none."""
     gap = (grid[:, None] - grid).square().sum(-1)
-    near = torch.full((1, num, 12), num)
-    for i, row in enumerate((gap <= radius**2) & (gap > 0)):
-        found = row.nonzero()[:, 0]
-        near[0, i, : len(found)] = found
-    return near
+    near = torch.where((gap <= radius**2) & (gap > 0), torch.arange(len(grid)), num)
+    return padded(torch.nn.functional.pad(near, (0, 12), value=num).sort(1).values[:, :12], num, num)
 
 
 def together(views: list[View]) -> Observation:

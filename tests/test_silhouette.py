@@ -112,7 +112,7 @@ def test_overhang_is_in_metres_whatever_the_weight(frame, weight):
     ],
 )
 def test_the_pull_reduces_the_overhang(frame, joint, angle):
-    """Down the rows' gradient of the joint that was moved, the rims come back, by the overhang's own measure."""
+    """Down the gradient of the joint that was moved the rims come back, by the overhang's own measure."""
     body, pose, nearest = frame
     moved = kick(body, pose, joint, angle)
     rows = silhouette_rows(body(moved), nearest, CAMERA, CONFIG)

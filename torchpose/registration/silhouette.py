@@ -53,7 +53,7 @@ def nearest_inside(mask: Bool[Tensor, "batch height width"]) -> Float[Tensor, "b
 
 
 def silhouette_rows(
-    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: RimConfig
+    posed: PosedBody, nearest: Float[Tensor, "#batch height width 2"], camera: StereoCamera, config: RimConfig
 ) -> Rows:
     """A row for each rim point of each part: where it projects beside the mask, the mask's edge draws it.
 
@@ -70,7 +70,8 @@ def silhouette_rows(
     H, W = nearest.shape[1:3]
     edge = torch.tensor([W - 1, H - 1], dtype=pixel.dtype, device=pixel.device)
     seen = ((pixel > 0) & (pixel < edge)).all(-1)
-    index = pixel.detach().round().clamp(min=torch.zeros_like(edge), max=edge).long()
+    # Rows that are not finite stay so, by `pixel`; their index must still be one.
+    index = pixel.detach().nan_to_num().round().clamp(min=torch.zeros_like(edge), max=edge).long()
     flat = (index[..., 1] * W + index[..., 0])[..., None].expand(-1, -1, 2)
     goal = nearest.flatten(1, 2).expand(B, -1, -1).gather(1, flat).to(points)
     # From whole pixel to whole pixel: what rounding leaves of the rest must not turn the way.
@@ -86,7 +87,7 @@ def silhouette_rows(
 
 
 def overhang(
-    posed: PosedBody, nearest: Float[Tensor, "batch height width 2"], camera: StereoCamera, config: RimConfig
+    posed: PosedBody, nearest: Float[Tensor, "#batch height width 2"], camera: StereoCamera, config: RimConfig
 ) -> Float[Tensor, " batch"]:
     """How far the body's rims stand out of the mask, m: mean over the rim points, each at most `reach`."""
     rows = silhouette_rows(posed, nearest, camera, config)

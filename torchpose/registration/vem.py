@@ -70,7 +70,7 @@ class Observation:
 
     cloud: PointCloud
     potential: Float[Tensor, "batch num parts"]  # log-potentials of the appearance terms
-    nearest: Float[Tensor, "batch height width 2"]  # `nearest_inside` of the silhouette
+    nearest: Float[Tensor, "#batch height width 2"]  # `nearest_inside` of the silhouette
     camera: StereoCamera
     geodesic: GeodesicTerm | None = None
 
