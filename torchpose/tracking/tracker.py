@@ -144,7 +144,7 @@ class Tracker(nn.Module):
             anew = self.starter(observation, faces, size)
             if self.acceptable(anew):
                 found, status = anew, TrackStatus.recovered
-                self._velocity = None
+                self.forget()  # the way here from the last pose is a jump, no velocity
         if not self.acceptable(found):
             return TrackedFrame(TrackStatus.lost, None)
         self._remember(found, time_s)
