@@ -55,10 +55,9 @@ class Recognition:
     """What the sequences are (4.16). NaN: nothing was observed; for the odds, or no model is possible."""
 
     log_likelihood: Float[Tensor, "sequences activities"]  # nats per observed frame
-    activity: Int[Tensor, " sequences"]  # the most likely, -1 where there is no answer
-    log_odds: Float[
-        Tensor, " sequences"
-    ]  # the best over the next best, nats per frame; inf with one activity
+    activity: Int[Tensor, " sequences"]  # the most likely; -1: no answer
+    # The best score over the next best, nats per frame; infinite where there is no other activity.
+    log_odds: Float[Tensor, " sequences"]
     # The best over a background model, the shares of the symbols in all training frames; low: none of these.
     log_odds_background: Float[Tensor, " sequences"]
     answer: Int[Tensor, " sequences"]  # `Answer`
@@ -145,8 +144,8 @@ class Recognizer(nn.Module):
                 f"every activity needs frames in which the person was seen, got none for {', '.join(empty)}"
             )
         self.activities, self.fitted = activities, training
-        pseudo = max(self.config.hmm.emission_prior - 1, 0.0)
-        counts = symbols[symbols != MISSING].bincount(minlength=self.config.codebook.size) + pseudo
+        counts = symbols[symbols != MISSING].bincount(minlength=self.config.codebook.size)
+        counts = counts + (self.config.hmm.emission_prior - 1)
         self.log_background = (counts / counts.sum()).log().to(self.hmm.log_emission)
         return self
 
