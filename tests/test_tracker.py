@@ -1,0 +1,275 @@
+"""The life of a track: by scripted registrations its statuses and memory, by synthetic views the whole of it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from synthetic_cloud import RELAXED, see, standing
+from torch.testing import assert_close
+
+from torchpose.body.model import BodyModel
+from torchpose.least_squares import Status
+from torchpose.registration.start import StartConfig, Starter
+from torchpose.registration.vem import Registrar, Registration, RegistrationConfig
+from torchpose.tracking.tracker import ANSWERED, Tracker, TrackingConfig, TrackStatus
+
+CONFIG = TrackingConfig()
+GOOD, BAD = 0.01, 1.0  # m of misfit
+
+
+@pytest.fixture(scope="module")
+def body():
+    return BodyModel()
+
+
+@pytest.fixture(scope="module")
+def view(body):
+    return see(body, standing(body), num=60)
+
+
+def registration(pose, misfit=GOOD, stray=0.0, status=Status.CONVERGED):
+    """Registrations of these poses, of whose 100 points a share strays."""
+    B, P = pose.shape
+    distance = torch.full((B, 100), 0.005)
+    distance[:, : round(100 * stray)] = 0.5
+    level = torch.full((B,), misfit)
+    return Registration(
+        pose,
+        torch.eye(P).expand(B, P, P),
+        torch.full((B, 15, 100), 1 / 15),
+        distance,
+        distance.mean(1),
+        level,
+        torch.zeros(1, B),
+        torch.full((B,), int(status)),
+    )
+
+
+class ScriptedRegistrar(Registrar):
+    """Answers every start with `pose` (None: the start itself) and `misfit`, and remembers what it was asked."""
+
+    def __init__(self, body):
+        super().__init__(body)
+        self.pose, self.misfit, self.stray, self.starts, self.prior = None, GOOD, 0.0, None, None
+
+    def forward(self, observation, start, size, prior=None, rounds=None, sigma_first=None):
+        self.starts, self.prior = start, prior
+        pose = start if self.pose is None else self.pose.expand_as(start)
+        return registration(pose, self.misfit, self.stray)
+
+
+class ScriptedStarter(Starter):
+    def __init__(self, body):
+        super().__init__(body, StartConfig(), RegistrationConfig())
+        self.pose, self.misfit, self.refreshed, self.status = None, GOOD, None, Status.CONVERGED
+        self.calls = []
+
+    def forward(self, observation, faces, size):
+        self.calls.append("cold")
+        return registration(self.pose, self.misfit, status=self.status)
+
+    def refresh(self, observation, pose, size):
+        self.calls.append("refresh")
+        return registration(pose, BAD) if self.refreshed is None else self.refreshed
+
+
+@pytest.fixture
+def scripted(body):
+    registrar, starter = ScriptedRegistrar(body), ScriptedStarter(body)
+    starter.pose = standing(body)
+    return Tracker(body, CONFIG, registrar, starter), registrar, starter
+
+
+@pytest.fixture
+def step(body, view):
+    def advance(tracker, time_s, present=True, cut=False):
+        observation, faces = (view.observation(), view.no_face()) if present else (None, None)
+        frame = tracker(time_s, observation, faces, body.default_size(1), cut)
+        assert (frame.registration is not None) == (frame.status in ANSWERED)
+        return frame
+
+    return advance
+
+
+def test_a_life(scripted, step):
+    """Nobody, somebody unclear, tracked, lost, found anew, gone, back."""
+    tracker, registrar, starter = scripted
+    assert step(tracker, 0.0, present=False).status is TrackStatus.absent
+    starter.misfit = BAD
+    assert step(tracker, 0.05).status is TrackStatus.entering
+    starter.misfit = GOOD
+    assert step(tracker, 0.1).status is TrackStatus.tracked
+    assert step(tracker, 0.15).status is TrackStatus.tracked
+    registrar.misfit = starter.misfit = BAD
+    assert step(tracker, 0.2).status is TrackStatus.lost
+    starter.misfit = GOOD
+    assert step(tracker, 0.25).status is TrackStatus.recovered
+    registrar.misfit = GOOD
+    assert step(tracker, 0.3).status is TrackStatus.tracked
+    assert step(tracker, 0.35, present=False).status is TrackStatus.absent
+    assert step(tracker, 0.4).status is TrackStatus.tracked
+
+
+def test_a_person_cut_by_the_border_is_partial(scripted, step):
+    tracker, _, _ = scripted
+    assert step(tracker, 0.0, cut=True).status is TrackStatus.partial
+    assert step(tracker, 0.1, cut=True).status is TrackStatus.partial
+    assert step(tracker, 0.2).status is TrackStatus.tracked
+
+
+def test_the_next_frame_starts_from_the_prediction_and_from_the_last_pose(scripted, step, body):
+    tracker, registrar, _ = scripted
+    step(tracker, 0.0)
+    first = standing(body)
+    step(tracker, 0.1)
+    assert_close(registrar.starts, first.expand(2, -1))  # no velocity yet
+    registrar.pose = first + 0.02
+    step(tracker, 0.2)  # moves by 0.02 in 0.1 s
+    step(tracker, 0.5)  # 0.3 s later
+    predicted = first + 0.02 + CONFIG.velocity * 0.2 * 0.3
+    assert_close(registrar.starts, torch.cat([predicted, first + 0.02]))
+    assert_close(registrar.prior.mean, predicted.expand(2, -1))
+    sd = registrar.prior.precision.rsqrt()[0]
+    assert_close(sd[:6], torch.full((6,), CONFIG.root_speed_sd * 0.3))
+    assert_close(sd[6:], torch.full((18,), CONFIG.joint_speed_sd * 0.3))
+
+
+def test_identical_times_do_not_divide_by_zero(scripted, step):
+    tracker, registrar, _ = scripted
+    for _ in range(3):
+        frame = step(tracker, 1.0)
+        assert frame.status is TrackStatus.tracked
+    assert registrar.starts.isfinite().all()
+    assert registrar.prior.precision.isfinite().all()
+
+
+def test_after_a_recovery_there_is_no_velocity(scripted, step, body):
+    """The way from the last pose to where the person was found anew is no motion."""
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    step(tracker, 0.05)
+    registrar.misfit = BAD
+    starter.pose = standing(body, x=1.0)
+    assert step(tracker, 0.1).status is TrackStatus.recovered
+    registrar.misfit = GOOD
+    step(tracker, 0.15)
+    assert_close(registrar.starts, starter.pose.expand(2, -1))
+
+
+def test_a_lost_person_is_remembered_for_a_while_and_then_forgotten(scripted, step):
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    calls = len(starter.calls)
+    assert step(tracker, CONFIG.memory - 0.1).status is TrackStatus.tracked
+    assert len(starter.calls) == calls  # followed, not searched for
+    step(tracker, 2 * CONFIG.memory + 0.1)
+    assert starter.calls[calls:] == ["cold"]
+    registrar.misfit = starter.misfit = BAD
+    assert step(tracker, 2 * CONFIG.memory + 0.2).status is TrackStatus.lost
+    # Lost frames do not prolong the memory.
+    assert step(tracker, 3 * CONFIG.memory + 0.3).status is TrackStatus.entering
+
+
+def test_stray_points_have_the_limbs_sought(scripted, step, body):
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    registrar.stray = 2 * CONFIG.stray_share
+    better = registration(standing(body) + 0.01, misfit=GOOD / 2)
+    starter.refreshed = better
+    frame = step(tracker, 0.1)
+    assert starter.calls[-1] == "refresh"
+    assert frame.registration is better
+    starter.refreshed = registration(standing(body) + 0.01, misfit=2 * GOOD, stray=2 * CONFIG.stray_share)
+    frame = step(tracker, 0.2)
+    assert frame.registration.misfit == GOOD  # what does not fit better is not taken
+
+
+def test_an_answer_that_is_not_finite_is_none(scripted, step, body):
+    tracker, _, starter = scripted
+    starter.status = Status.NON_FINITE
+    assert step(tracker, 0.0).status is TrackStatus.entering
+    starter.status, starter.pose = Status.CONVERGED, torch.full((1, 24), torch.nan)
+    assert step(tracker, 0.1).status is TrackStatus.entering
+
+
+def test_forgetting_starts_over_and_begin_takes_a_known_pose(scripted, step, body):
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    tracker.forget()
+    step(tracker, 0.1)
+    assert starter.calls == ["cold", "cold"]
+    tracker.begin(standing(body, x=0.3), 0.2)
+    step(tracker, 0.25)
+    assert starter.calls == ["cold", "cold"]
+    assert_close(registrar.starts, standing(body, x=0.3).expand(2, -1))
+
+
+def test_a_restored_track_goes_on_as_if_never_stopped(scripted, step, body):
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    registrar.pose = standing(body) + 0.02
+    step(tracker, 0.1)
+    other = Tracker(body, CONFIG, registrar, starter)
+    other.restore(tracker.state())
+    step(tracker, 0.2)
+    expected = registrar.starts
+    step(other, 0.2)
+    assert_close(registrar.starts, expected)
+    other.forget()
+    assert other.state() == {}
+    other.restore({})
+    assert step(other, 0.3, present=False).status is TrackStatus.absent
+
+
+def moving(body, t):
+    """The left arm rises to the side by 100 degrees a second while the person steps sideways."""
+    directions = RELAXED.clone()
+    angle = torch.tensor(0.3 + 1.75 * t)
+    aim = torch.stack([angle.sin(), angle.cos(), torch.tensor(-0.1)])
+    directions[1], directions[2] = aim, aim
+    return standing(body, directions, x=0.3 * t)
+
+
+def test_a_moving_person_is_followed(body):
+    """Synthetic views at 20 frames a second, from nothing, with one empty frame and one of two thirds of a second."""
+    registration = RegistrationConfig()
+    tracker = Tracker(body, CONFIG, Registrar(body, registration), Starter(body, StartConfig(), registration))
+    size = body.default_size(1)
+    statuses, errors = [], []
+    for t in (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.9, 0.95):
+        pose = moving(body, t)
+        seen = see(body, pose, num=200, noise=0.003, generator=torch.Generator().manual_seed(0))
+        there = t != 0.15
+        frame = tracker(t, seen.observation() if there else None, seen.no_face() if there else None, size)
+        statuses.append(frame.status)
+        if frame.registration is not None:
+            errors.append((body(frame.registration.pose).joints - body(pose).joints).norm(dim=-1))
+    assert statuses[3] is TrackStatus.absent
+    assert all(status in ANSWERED for i, status in enumerate(statuses) if i != 3)
+    assert statuses[0] is TrackStatus.tracked
+    assert torch.cat(errors).mean(1).max() < 0.04  # m, in the worst frame
+
+
+def test_an_identical_frame_has_the_identical_pose(body):
+    registration = RegistrationConfig()
+    tracker = Tracker(body, CONFIG, Registrar(body, registration), Starter(body, StartConfig(), registration))
+    seen = see(body, standing(body), num=200)
+    frames = []
+    tracker.begin(standing(body), 0.0)
+    for i in range(1, 6):
+        frame = tracker(0.05 * i, seen.observation(), seen.no_face(), body.default_size(1))
+        frames.append(body(frame.registration.pose).joints)
+    assert (frames[-1] - frames[-2]).norm(dim=-1).max() < 0.015  # m: it does not wander
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"velocity": 1.5}, "velocity must be between 0 and 1, got 1.5"),
+        ({"memory": 0.0}, "memory must be positive, got 0.0"),
+        ({"accept_misfit": -1.0}, "accept_misfit must be positive, got -1.0"),
+    ],
+)
+def test_bad_settings_are_told(setting, message):
+    with pytest.raises(ValueError, match=message.replace(".", r"\.")):
+        replace(CONFIG, **setting)
