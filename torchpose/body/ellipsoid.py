@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchpose.body.model import PosedBody
 
-# Newton from below converges monotonically; 8 steps reach 2e-16 relative, measured over 1e6 spheroids and
-# points.
-NEWTON_STEPS = 8
+# With one differentiable step after them. Measured against 60 steps on 14 million pairs, 1e-8 to 1000 radii away
+# and c/a from 1 to 1000: distances to 5e-16 in double and 5e-7 m in single precision; 3 steps leave 4e-10.
+NEWTON_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,12 @@ def nearest_point(
         return s + N * (N.sqrt() - 1) / slope
 
     with torch.no_grad():
-        s = torch.maximum(r0 / a, (z.abs() / c - slack) / flat)
+        p, q = r0 / a, z.abs() / c
+        # Three lower bounds: each term of N alone; and near the long axis, where Newton creeps from those,
+        # (p/s)^2 = 1 - (v/c)^2 <= 2 (short + flat s) / m, of which one summand is at least half of (p/s)^2.
+        m, short = torch.maximum(slack, q), (slack - q).clamp_min(torch.finfo(local.dtype).tiny)
+        near = torch.minimum((m * p * p / (4 * flat)) ** (1 / 3), p * (m / (4 * short)).sqrt())
+        s = torch.maximum(torch.maximum(p, (q - slack) / flat), near)
         for _ in range(NEWTON_STEPS):
             s = newton(s)
     s = newton(s)

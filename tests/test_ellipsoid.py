@@ -1,0 +1,472 @@
+"""Distances to spheroids against minimisation by SciPy, dense search and the homogeneous form."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.optimize
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchpose.body.ellipsoid import (
+    FootPoint,
+    algebraic_distance,
+    foot_point,
+    nearest_point,
+    outline,
+    surface_normal,
+    to_camera,
+    to_local,
+)
+from torchpose.body.model import PosedBody, spheroid_matrix
+from torchpose.geometry import exp_rotation
+
+F64 = torch.float64
+
+
+def spheroids(centers: Tensor, turns: Tensor, radii: Tensor) -> PosedBody:
+    """A posed "body" of nothing but spheroids: centres (K, 3), rotation vectors (K, 3), radii (K, 2)."""
+    none = torch.zeros(1, 0, 3, dtype=centers.dtype)
+    return PosedBody(
+        torch.zeros(1, 0, 3, 3, dtype=centers.dtype),
+        none,
+        centers[None],
+        exp_rotation(turns)[None],
+        radii[None],
+        none,
+        none,
+        none,
+    )
+
+
+def scene(num: int, dtype: torch.dtype = F64) -> PosedBody:
+    """Spheroids of all slants, 2 to 4 m from the camera, of a body's sizes."""
+    g = torch.Generator().manual_seed(1)
+    centers = torch.randn(num, 3, generator=g, dtype=F64) * 0.5 + torch.tensor([0.0, 0.0, 3.0], dtype=F64)
+    a = 0.03 + 0.13 * torch.rand(num, 1, generator=g, dtype=F64)
+    radii = torch.cat([a, a * (1 + 4 * torch.rand(num, 1, generator=g, dtype=F64))], 1)
+    turns = torch.randn(num, 3, generator=g, dtype=F64)
+    return spheroids(*(x.to(dtype) for x in (centers, turns, radii)))
+
+
+def around(posed: PosedBody, num: int, reach: float = 2.0) -> Tensor:
+    """Points inside and around the spheroids of a scene, camera's frame."""
+    radii = posed.radii[..., [0, 0, 1]]
+    local = torch.randn(*radii.shape[:2], num, 3, dtype=radii.dtype) * radii[:, :, None] * reach / 2
+    return to_camera(posed, local).flatten(1, 2)
+
+
+def distance_by_bisection(r0: float, z0: float, a: float, c: float) -> float:
+    """Distance of (r0, z0) to the ellipse u^2/a^2 + v^2/c^2 = 1, r0 and z0 >= 0, in double precision.
+
+    Eberly's method: the root of F(s) = (a r0 / s)^2 + (c z0 / (s + c^2 - a^2))^2 - 1, where s is the distance from the
+    last pole, by bisection. On the long axis, where that pole is none, the closed form.
+    """
+    if r0 == 0:
+        turning = c - a * a / c  # the evolute's cusp: nearer to the centre the side is nearer than the pole
+        if z0 >= turning:
+            return abs(z0 - c)
+        v = z0 / (1 - (a / c) ** 2) if a < c else 0.0
+        return math.hypot(a * math.sqrt(max(0.0, 1 - (v / c) ** 2)), z0 - v)
+    beyond = (c - a) * (c + a)
+
+    def F(s: float) -> float:
+        return (a * r0 / s) ** 2 + (c * z0 / (s + beyond)) ** 2 - 1
+
+    low, high = a * r0, math.hypot(a * r0, c * z0) * (1 + 1e-15)
+    for _ in range(120):
+        middle = (low + high) / 2
+        low, high = (middle, high) if F(middle) > 0 else (low, middle)
+    u, v = a * a * r0 / low, c * c * z0 / (low + beyond)
+    return math.hypot(r0 - u, z0 - v)
+
+
+def distance_by_search(r0: float, z0: float, a: float, c: float) -> float:
+    """The same by minimising over the ellipse's parameter from the best of a dense grid."""
+
+    def distance(t: float) -> float:
+        return math.hypot(a * math.cos(t) - r0, c * math.sin(t) - z0)
+
+    grid = np.linspace(0, math.pi / 2, 2001)
+    best = grid[np.argmin(np.hypot(a * np.cos(grid) - r0, c * np.sin(grid) - z0))]
+    step = grid[1]
+    found = scipy.optimize.minimize_scalar(
+        distance, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-12}
+    )
+    return min(found.fun, distance(best))
+
+
+def nearest(point: Tensor, a: float, c: float) -> Tensor:
+    """`nearest_point` of one point and one spheroid."""
+    radii = torch.tensor([[[a, c]]], dtype=point.dtype)
+    return nearest_point(point[None, None, None], radii)[0, 0, 0]
+
+
+# Named by where the point lies; radii in metres.
+HARD = {
+    "centre": ((0.0, 0.0, 0.0), 0.1, 0.3),
+    "centre of a ball": ((0.0, 0.0, 0.0), 0.2, 0.2),
+    "centre of a needle": ((0.0, 0.0, 0.0), 0.001, 0.4),
+    "long axis, inside, side is nearest": ((0.0, 0.0, 0.1), 0.1, 0.3),
+    "long axis, inside, pole is nearest": ((0.0, 0.0, 0.29), 0.1, 0.3),
+    "long axis, at the evolute's cusp": ((0.0, 0.0, 0.3 - 0.1**2 / 0.3), 0.1, 0.3),
+    "long axis, on the pole": ((0.0, 0.0, -0.3), 0.1, 0.3),
+    "long axis, outside": ((0.0, 0.0, -0.9), 0.1, 0.3),
+    "just off the axis": ((1e-9, -1e-9, 0.1), 0.1, 0.3),
+    "off the axis by single precision's last digit": ((0.0, 1e-7, -0.2), 0.1, 0.3),
+    "near the axis, inside": ((1e-4, 0.0, 0.25), 0.1, 0.3),
+    "equator plane, inside": ((0.03, -0.04, 0.0), 0.1, 0.3),
+    "equator plane, on the surface": ((0.06, 0.08, 0.0), 0.1, 0.3),
+    "equator plane, outside": ((0.3, 0.4, 0.0), 0.1, 0.3),
+    "just off the equator plane": ((0.03, 0.04, 1e-9), 0.1, 0.3),
+    "on the surface": ((0.06, 0.0, 0.24), 0.1, 0.3),
+    "far outside": ((30.0, -40.0, 70.0), 0.1, 0.3),
+    "needle, outside": ((0.02, 0.01, 0.1), 0.001, 0.4),
+    "needle, at its tip": ((0.0005, 0.0, 0.3999), 0.001, 0.4),
+    "needle, inside": ((0.0003, 0.0, -0.2), 0.001, 0.4),
+    "ball, inside": ((0.05, 0.1, -0.02), 0.2, 0.2),
+    "ball, outside": ((0.5, 0.1, -0.2), 0.2, 0.2),
+    "almost a ball": ((1e-6, 0.0, 2e-6), 0.2, 0.2000001),
+}
+radius = st.floats(0.01, 0.3)
+coordinate = st.one_of(st.floats(-3, 3), st.floats(-1e-6, 1e-6), st.just(0.0))
+
+
+class TestNearestPoint:
+    @pytest.mark.parametrize("name", HARD)
+    def test_the_oracles_agree(self, name: str) -> None:
+        """Bisection and minimisation know nothing of each other."""
+        (x, y, z), a, c = HARD[name]
+        args = (math.hypot(x, y), abs(z), a, c)
+        assert distance_by_bisection(*args) == pytest.approx(distance_by_search(*args), abs=1e-9)
+
+    @pytest.mark.parametrize("dtype", [torch.float32, F64], ids=["single", "double"])
+    @pytest.mark.parametrize("name", HARD)
+    def test_hard_cases(self, name: str, dtype: torch.dtype) -> None:
+        point, a, c = HARD[name]
+        self.assert_nearest(torch.tensor(point, dtype=dtype), a, c)
+
+    @given(coordinate, coordinate, coordinate, radius, st.floats(1, 30))
+    def test_any_spheroid_and_point(self, x: float, y: float, z: float, a: float, ratio: float) -> None:
+        for dtype in (torch.float32, F64):
+            self.assert_nearest(torch.tensor([x, y, z], dtype=dtype), a, a * ratio)
+
+    @given(st.floats(-9, 0), st.floats(-3e-2, 3e-2), radius, st.floats(1.01, 30))
+    def test_near_the_cusp(self, exponent: float, off: float, a: float, ratio: float) -> None:
+        """About the end of the medial axis iterations converge worst (8 plain Newton steps left 5e-5 m)."""
+        c = a * ratio
+        point = torch.tensor(
+            [0.6 * a * 10**exponent, -0.8 * a * 10**exponent, (c - a * a / c) * (1 + off)], dtype=F64
+        )
+        self.assert_nearest(point, a, c)
+        self.assert_nearest(point.float(), a, c)
+
+    @staticmethod
+    def assert_nearest(point: Tensor, a: float, c: float) -> None:
+        foot = nearest(point, a, c)
+        # The oracle gets the numbers that single precision has made of them.
+        a, c = (torch.tensor(r, dtype=point.dtype).double().item() for r in (a, c))
+        x, y, z = point.double().tolist()
+        expected = distance_by_bisection(math.hypot(x, y), abs(z), a, c)
+        # METHOD's 1e-6 m, plus the half unit of the last digit that a coordinate of many metres has.
+        size = float(point.abs().max()) + c
+        rounding = size * torch.finfo(point.dtype).eps
+        atol = (1e-6 if point.dtype == torch.float32 else 1e-12) + rounding
+        assert (point.double() - foot.double()).norm().item() == pytest.approx(expected, abs=atol)
+        u, v, w = foot.double().tolist()
+        # On the surface: along the normal that is off by the form's error over its slope.
+        form = math.hypot(u / a, v / a, w / c) - 1
+        assert abs(form) * a < atol
+
+    def test_many_at_once_equal_one_by_one(self) -> None:
+        radii = torch.tensor([[[0.1, 0.3], [0.05, 0.05]], [[0.2, 0.25], [0.01, 0.4]]], dtype=F64)
+        points = torch.randn(2, 2, 7, 3, dtype=F64) * 0.3
+        feet = nearest_point(points, radii)
+        for b in range(2):
+            for k in range(2):
+                for n in range(7):
+                    alone = nearest(points[b, k, n], *radii[b, k].tolist())
+                    assert_close(feet[b, k, n], alone, atol=1e-15, rtol=0)
+
+    def test_turns_and_flips_with_the_point(self) -> None:
+        """A spheroid looks the same turned about its axis and from its other end."""
+        point = torch.tensor([0.05, 0.02, 0.17], dtype=F64)
+        foot = nearest(point, 0.1, 0.3)
+        turn = exp_rotation(torch.tensor([0.0, 0.0, 2.1], dtype=F64))
+        flip = torch.tensor([1.0, 1.0, -1.0], dtype=F64)
+        assert_close(nearest(turn @ point, 0.1, 0.3), turn @ foot, atol=1e-14, rtol=0)
+        assert_close(nearest(flip * point, 0.1, 0.3), flip * foot, atol=1e-14, rtol=0)
+
+    @pytest.mark.parametrize(
+        "point",
+        [(0.3, -0.1, 0.4), (0.02, 0.03, 0.1), (0.0601, 0.0, 0.24), (0.3, 0.2, 0.0), (0.02, 0.05, 0.0)],
+        ids=["outside", "inside", "near the surface", "equator plane outside", "equator plane inside"],
+    )
+    def test_gradients(self, point: tuple[float, float, float]) -> None:
+        inputs = (
+            torch.tensor([[[point]]], dtype=F64, requires_grad=True),
+            torch.tensor([[[0.1, 0.3]]], dtype=F64, requires_grad=True),
+        )
+        assert torch.autograd.gradcheck(nearest_point, inputs, atol=1e-6)
+        # The gradient of the distance is the unit vector from the foot, which autograd does not know.
+        local, radii = inputs
+        (gap := (local - nearest_point(local, radii))).norm().backward()
+        assert local.grad is not None
+        assert_close(local.grad, (gap / gap.norm()).detach(), atol=1e-7, rtol=0)
+
+    @pytest.mark.parametrize("name", HARD)
+    def test_gradients_are_finite_everywhere(self, name: str) -> None:
+        point, a, c = HARD[name]
+        local = torch.tensor([[[point]]], dtype=F64, requires_grad=True)
+        radii = torch.tensor([[[a, c]]], dtype=F64, requires_grad=True)
+        nearest_point(local, radii).sum().backward()
+        assert local.grad is not None
+        assert radii.grad is not None
+        assert local.grad.isfinite().all()
+        assert radii.grad.isfinite().all()
+
+
+class TestSurfaceNormal:
+    def test_is_unit_outward_and_square_to_the_surface(self) -> None:
+        posed = scene(6)
+        extent = posed.radii[..., [0, 0, 1]][:, :, None]
+        ball = torch.nn.functional.normalize(torch.randn(1, 6, 50, 3, dtype=F64), dim=-1)
+        point = ball * extent
+        normal = surface_normal(point, posed.radii)
+        assert_close(normal.norm(dim=-1), torch.ones(1, 6, 50, dtype=F64), atol=1e-14, rtol=0)
+        form = ((point + 1e-4 * normal) / extent).norm(dim=-1)
+        assert (form > 1).all()
+        # A curve on the surface through the point moves square to the normal.
+        across = torch.linalg.cross(ball, torch.randn(1, 6, 50, 3, dtype=F64)) * extent
+        assert_close((across * normal).sum(-1), torch.zeros(1, 6, 50, dtype=F64), atol=1e-14, rtol=0)
+
+    def test_gap_of_a_nearest_point_is_along_it(self) -> None:
+        posed = scene(6)
+        local = to_local(posed, around(posed, 20))
+        foot = nearest_point(local, posed.radii)
+        gap = torch.nn.functional.normalize(local - foot, dim=-1)
+        along = (gap * surface_normal(foot, posed.radii)).sum(-1).abs()
+        assert_close(along, torch.ones_like(along), atol=1e-6, rtol=0)
+
+
+class TestFrames:
+    def test_there_and_back(self) -> None:
+        posed = scene(5)
+        points = around(posed, 4)
+        local = to_local(posed, points)
+        assert_close(to_camera(posed, local), points[:, None].expand(-1, 5, -1, -1), atol=1e-14, rtol=0)
+        assert_close(
+            to_local(posed, posed.centers)[0].diagonal().mT, torch.zeros(5, 3, dtype=F64), atol=1e-15, rtol=0
+        )
+
+
+def faces_camera(posed: PosedBody, foot: FootPoint) -> Tensor:
+    """Cosine between the surface's normal and the way to the camera: positive where the camera sees it."""
+    place = to_camera(posed, foot.local)
+    normal = (posed.frames[:, :, None] @ foot.normal[..., None])[..., 0]
+    return -(torch.nn.functional.normalize(place, dim=-1) * normal).sum(-1)
+
+
+class TestFootPoint:
+    def test_plain_is_the_nearest_point(self) -> None:
+        posed = scene(8)
+        points = around(posed, 30)
+        foot = foot_point(posed, points, visible=False)
+        local = to_local(posed, points)
+        assert_close(foot.local, nearest_point(local, posed.radii))
+        assert_close(foot.residual, local - foot.local)
+        assert_close(foot.distance, (local - foot.local).norm(dim=-1))
+        assert torch.equal(foot.hidden, faces_camera(posed, foot) < 0)
+        assert 0.2 < foot.hidden.double().mean() < 0.8
+
+    def test_visible_or_on_the_rim(self) -> None:
+        posed = scene(8)
+        points = around(posed, 40, reach=4.0)
+        foot, plain = foot_point(posed, points), foot_point(posed, points, visible=False)
+        assert torch.equal(foot.hidden, plain.hidden)
+        facing = faces_camera(posed, foot)
+        assert (facing > -1e-7).all()
+        assert_close(facing[foot.hidden], torch.zeros_like(facing[foot.hidden]), atol=1e-7, rtol=0)
+        # On the surface, all of them; and on the visible side nothing has changed.
+        form = (foot.local / posed.radii[..., [0, 0, 1]][:, :, None]).norm(dim=-1)
+        assert_close(form, torch.ones_like(form), atol=1e-12, rtol=0)
+        assert_close(foot.local[~foot.hidden], plain.local[~foot.hidden], atol=0, rtol=0)
+        assert (foot.distance >= plain.distance - 1e-12).all()
+
+    def test_is_the_nearest_of_all_visible_points(self) -> None:
+        """Against a dense sampling of the side that faces the camera."""
+        posed = scene(6)
+        # A sunflower spreads evenly over the ball; the rim, where most answers lie, is sampled on top.
+        n = torch.arange(40_000, dtype=F64) + 0.5
+        height, turn = 1 - 2 * n / 40_000, n * math.pi * (3 - 5**0.5)
+        level = (1 - height**2).sqrt()
+        ball = torch.stack([level * turn.cos(), level * turn.sin(), height], -1)
+        surface = to_camera(posed, ball * posed.radii[..., [0, 0, 1]][:, :, None])
+        normal = surface_normal(to_local_each(posed, surface), posed.radii)
+        normal = (posed.frames[:, :, None] @ normal[..., None])[..., 0]
+        seen = (surface * normal).sum(-1) < 0
+        points = around(posed, 3, reach=3.0)
+        foot = foot_point(posed, points)
+        for k in range(6):
+            samples = torch.cat([surface[0, k, seen[0, k]], outline(posed, 2000)[0, k]])
+            expected = torch.cdist(points[0], samples).amin(1)
+            assert_close(foot.distance[0, k], expected, atol=3e-4, rtol=0)
+            # The samples are spaced by millimetres: they can be further away, never nearer.
+            assert (foot.distance[0, k] <= expected + 1e-9).all()
+
+    def test_distance_is_continuous_across_the_rim(self) -> None:
+        """Along lines through spheroids of every slant the distance changes by no more than the way walked.
+
+        (Turning the hidden points to the near side of the rim's plane made it jump by up to 5 cm.)
+        """
+        posed = scene(12)
+        start = around(posed, 20).unflatten(1, (12, 20))
+        way = torch.nn.functional.normalize(torch.randn(1, 12, 20, 1, 3, dtype=F64), dim=-1)
+        walk = torch.linspace(-0.2, 0.2, 801, dtype=F64)
+        for k in range(12):
+            lines = start[:, k, :, None] + walk[:, None] * way[:, k]
+            foot = foot_point(posed, lines.flatten(1, 2))
+            distance = foot.distance[0].unflatten(1, (20, 801))
+            assert (distance.diff(dim=-1).abs() <= walk[1] - walk[0] + 1e-9).all()
+            crossed = foot.hidden[0].unflatten(1, (20, 801)).diff(dim=-1)
+            assert crossed.any()
+
+    def test_gap_to_a_rim_point_is_square_to_the_rim(self) -> None:
+        """Moving along the rim does not bring the foot nearer."""
+        posed = scene(1)
+        points = around(posed, 40)
+        foot = foot_point(posed, points)
+        rim = outline(posed, 20_000)[0, 0]
+        place = to_camera(posed, foot.local)[0, 0][foot.hidden[0, 0]]
+        index = torch.cdist(place, rim).argmin(1)
+        tangent = torch.nn.functional.normalize(rim[(index + 1) % 20_000] - rim[index - 1], dim=-1)
+        gap = torch.nn.functional.normalize(points[0][foot.hidden[0, 0]] - place, dim=-1)
+        assert len(gap) > 5
+        assert_close((gap * tangent).sum(-1), torch.zeros(len(gap), dtype=F64), atol=2e-3, rtol=0)
+
+    def test_camera_inside_sees_no_rim(self) -> None:
+        posed = spheroids(
+            torch.tensor([[0.01, 0.0, 0.02]], dtype=F64),
+            torch.zeros(1, 3, dtype=F64),
+            torch.tensor([[0.1, 0.3]], dtype=F64),
+        )
+        foot = foot_point(posed, torch.randn(1, 20, 3, dtype=F64))
+        assert not foot.hidden.any()
+        assert foot.local.isfinite().all()
+
+    def test_camera_on_the_long_axis(self) -> None:
+        """The rim is then a circle, whose axes are arbitrary."""
+        posed = spheroids(
+            torch.tensor([[0.0, 0.0, 3.0]], dtype=F64),
+            torch.zeros(1, 3, dtype=F64),
+            torch.tensor([[0.1, 0.3]], dtype=F64),
+        )
+        # C = 10 half lengths away: the rim is at 1/10 of them, sqrt(1 - 1/100) wide.
+        point = torch.tensor([[[0.0, 0.2, 3.2]]], dtype=F64)
+        foot = foot_point(posed, point)
+        assert foot.hidden.all()
+        expected = torch.tensor([0.0, 0.1 * math.sqrt(1 - 0.01), -0.3 * 0.1], dtype=F64)
+        assert_close(foot.local[0, 0, 0], expected, atol=1e-12, rtol=0)
+
+    @pytest.mark.parametrize("visible", [True, False])
+    def test_gradient_of_the_distance(self, visible: bool) -> None:
+        base = scene(3)
+        points = around(base, 2).requires_grad_()
+        centers, radii = base.centers.clone().requires_grad_(), base.radii.clone().requires_grad_()
+        turns = torch.zeros(3, 3, dtype=F64, requires_grad=True)
+
+        def distance(points: Tensor, centers: Tensor, turns: Tensor, radii: Tensor) -> Tensor:
+            posed = PosedBody(
+                base.rotations,
+                base.origins,
+                centers,
+                exp_rotation(turns)[None] @ base.frames,
+                radii,
+                base.joints,
+                base.screw_axes,
+                base.screw_origins,
+            )
+            return foot_point(posed, points, visible).distance
+
+        assert foot_point(base, points).hidden.any()
+        assert torch.autograd.gradcheck(distance, (points, centers, turns, radii), atol=1e-6)
+
+    def test_single_precision(self) -> None:
+        posed, single = scene(6), scene(6, torch.float32)
+        points = around(posed, 50)
+        error = (foot_point(single, points.float()).distance - foot_point(posed, points).distance).abs()
+        # 1e-6 m of the solver, and the rounding of coordinates of 3 m.
+        assert error.max() < 3e-6
+
+    def test_batch_equals_one_by_one(self) -> None:
+        posed = scene(4)
+        points = around(posed, 10)
+        both = foot_point(repeat(posed, 2), torch.cat([points, points.flip(1)]))
+        assert_close(both.local[:1], foot_point(posed, points).local, atol=1e-14, rtol=0)
+        assert_close(both.local[1:], foot_point(posed, points.flip(1)).local, atol=1e-14, rtol=0)
+
+
+def repeat(posed: PosedBody, times: int) -> PosedBody:
+    return PosedBody(
+        *(getattr(posed, name).repeat_interleave(times, 0) for name in PosedBody.__dataclass_fields__)
+    )
+
+
+def to_local_each(posed: PosedBody, points: Tensor) -> Tensor:
+    """Points (B, K, N, 3) of the camera's frame, each spheroid's own, in its frame."""
+    return (points - posed.centers[:, :, None]) @ posed.frames
+
+
+class TestAlgebraicDistance:
+    def test_equals_the_homogeneous_form(self) -> None:
+        """q = X^T A X - 2 (T. 3.3)."""
+        posed = scene(5)
+        points = around(posed, 10, reach=4.0)
+        X = torch.cat([points, torch.ones_like(points[..., :1])], -1)[:, None]
+        q = (X @ spheroid_matrix(posed) * X).sum(-1) - 2
+        assert_close(algebraic_distance(posed, points), q, atol=1e-9, rtol=1e-9)
+
+    def test_sign_and_surface(self) -> None:
+        posed = scene(5)
+        foot = to_camera(posed, foot_point(posed, around(posed, 5), visible=False).local)
+        for k in range(5):
+            q = algebraic_distance(posed, foot[:, k])[0, k]
+            assert_close(q, torch.zeros_like(q), atol=1e-12, rtol=0)
+        q = algebraic_distance(posed, posed.centers)
+        assert_close(q.diagonal(dim1=1, dim2=2), -torch.ones(1, 5, dtype=F64), atol=1e-12, rtol=0)
+
+
+class TestOutline:
+    def test_lies_on_the_surface_and_its_rays_are_tangent(self) -> None:
+        posed = scene(20)
+        rim = outline(posed, 16)
+        assert rim.shape == (1, 20, 16, 3)
+        A = spheroid_matrix(posed)
+        X = torch.cat([rim, torch.ones_like(rim[..., :1])], -1)
+        form = (X @ A * X).sum(-1)
+        assert_close(form, torch.full_like(form, 2.0), atol=1e-10, rtol=0)
+        # The gradient of the form, A's rows times X, is square to the ray.
+        gradient = torch.nn.functional.normalize((X @ A)[..., :3], dim=-1)
+        slope = (gradient * torch.nn.functional.normalize(rim, dim=-1)).sum(-1)
+        assert_close(slope, torch.zeros_like(slope), atol=1e-12, rtol=0)
+
+    def test_goes_all_the_way_round(self) -> None:
+        """The rim's image has the spheroid's centre inside: the points' bearings about it cover the circle."""
+        posed = scene(20)
+        rim, center = (x[..., :2] / x[..., 2:] for x in (outline(posed, 32), posed.centers))
+        spokes = rim - center[:, :, None]
+        bearing = torch.atan2(spokes[..., 1], spokes[..., 0]).sort(dim=-1).values
+        gaps = torch.cat([bearing.diff(dim=-1), bearing[..., :1] + 2 * math.pi - bearing[..., -1:]], -1)
+        assert gaps.max() < 2.0
+
+    def test_gradient(self) -> None:
+        base = scene(2)
+
+        def rim(centers: Tensor, radii: Tensor) -> Tensor:
+            return outline(spheroids(centers, torch.full((2, 3), 0.4, dtype=F64), radii), 5)
+
+        inputs = (base.centers[0].clone().requires_grad_(), base.radii[0].clone().requires_grad_())
+        assert torch.autograd.gradcheck(rim, inputs, atol=1e-6)
