@@ -1,0 +1,232 @@
+"""The whole of `infer.py`: a recording in, every file of the contract out, and every bad recording in one sentence."""
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import torchpose as tp
+from torchpose import session
+from torchpose.cli import CONFIGS, infer_main, load_config
+from torchpose.export import JOINT_NAMES, pose_columns
+from torchpose.recording import Backgrounds, write_recording
+from torchpose.synthesis.database import SyntheticRecording, make_recording, synthetic_camera
+
+FRAMES = 7
+EMPTY, BROKEN = 4, 5  # a frame with nobody in it, and one that cannot be read
+# Small and quick: the person's height is given, so no other frames are searched for proportions.
+QUICK = ["pose.height=1.75", "pose.size.rounds=0", "pose.size_frames=1", "pose.start.final_rounds=4"]
+
+
+@pytest.fixture(scope="module")
+def synthetic() -> SyntheticRecording:
+    return make_recording("both_hands", 1, 0, FRAMES, synthetic_camera(320, 240, 10.0))
+
+
+@pytest.fixture(scope="module")
+def folder(synthetic: SyntheticRecording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording in which a frame is empty and a frame is damaged."""
+    path = tmp_path_factory.mktemp("recording") / "hands"
+    left, right = synthetic.background(2)
+    frames = [tp.Frame(i, i / 10, f.left[0], f.right[0]) for i, f in enumerate(synthetic)]
+    frames[EMPTY] = tp.Frame(EMPTY, EMPTY / 10, left[1], right[1])
+    write_recording(path, synthetic.camera, frames, Backgrounds(left, right))
+    (path / "right" / f"{BROKEN:06d}.png").write_bytes(b"not an image")
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording's results, made once."""
+    output = tmp_path_factory.mktemp("result")
+    assert infer_main([f"recording={folder}", f"output={output}", *QUICK]) == 0
+    return output
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with (path / "poses.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_file_is_there_and_nothing_else(result: Path):
+    names = {path.name for path in result.iterdir()}
+    assert names == {"poses.csv", "poses.npz", "overlay.mp4", "angles.png", "summary.json"}
+
+
+def test_the_table_has_the_contract_s_columns_and_a_row_a_frame(result: Path):
+    table = rows(result)
+    assert list(table[0]) == pose_columns(tp.ANATOMICAL_NAMES, tp.LIMB_ANGLE_NAMES)
+    assert [int(row["frame"]) for row in table] == list(range(FRAMES))
+    assert [float(row["time_s"]) for row in table] == pytest.approx([i / 10 for i in range(FRAMES)])
+
+
+def test_poses_are_right_against_the_renderer_s_truth(result: Path, synthetic: SyntheticRecording):
+    """At 320 x 240 and 3.3 m a pixel of disparity is 15 cm: 8 cm over all joints is what the image holds."""
+    sequence = tp.read_poses_csv(result / "poses.csv")
+    answered = torch.tensor(sequence.answered)
+    gap = (sequence.joints - synthetic.joints.to(sequence.joints))[answered, 3:].norm(dim=-1)
+    assert answered.sum() == FRAMES - 2
+    assert gap.mean() < 0.08
+    left, right = ((sequence.joints[answered, JOINT_NAMES.index(f"wrist_{s}"), 0]) for s in ("left", "right"))
+    assert (left > right).all()  # the subject's left is on the image's right
+
+
+def test_an_empty_frame_is_absent_and_a_damaged_one_lost_and_both_are_empty(result: Path):
+    table = rows(result)
+    assert table[EMPTY]["status"] == "absent"
+    assert table[BROKEN]["status"] == "lost"
+    for i in (EMPTY, BROKEN):
+        assert set(list(table[i].values())[3:]) == {""}
+    assert table[FRAMES - 1]["status"] in ("tracked", "recovered")
+
+
+def test_the_summary_says_what_was_wrong(result: Path):
+    summary = json.loads((result / "summary.json").read_text())
+    assert summary["status"]["absent"] == summary["status"]["lost"] == 1
+    assert summary["problems"] == [pytest.approx(summary["problems"][0])]
+    assert f"{BROKEN:06d}.png" in summary["problems"][0]
+    assert summary["settings"]["pose"]["height"] == 1.75
+    assert summary["version"] == tp.__version__
+
+
+def test_the_video_shows_every_frame(result: Path):
+    video = cv2.VideoCapture(str(result / "overlay.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES
+    images = [video.read()[1] for _ in range(FRAMES)]
+    assert images[0].shape == (240, 320, 3)
+    assert images[BROKEN].mean() < 0.2 * images[0].mean()  # unreadable: black
+
+
+def test_full_precision_agrees_with_the_table(result: Path):
+    table, full = tp.read_poses_csv(result / "poses.csv"), tp.read_poses_npz(result / "poses.npz")
+    assert full.pose is not None
+    assert full.pose.shape == (FRAMES, 24)
+    torch.testing.assert_close(table.angles, full.angles, atol=2e-4, rtol=0, equal_nan=True)  # 0.01 degree
+    sd = full.angle_sd[torch.tensor(full.answered)]
+    assert ((sd > 0) & (sd <= torch.pi)).all()
+
+
+def test_an_interrupted_run_goes_on_and_ends_the_same(
+    folder: Path, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(session, "PART", 2)
+    step = tp.StereoToPose.step
+
+    def interrupted(self, recording, position):
+        if position == 3:
+            raise KeyboardInterrupt
+        return step(self, recording, position)
+
+    command = [f"recording={folder}", f"output={tmp_path}", *QUICK]
+    with monkeypatch.context() as patch:
+        patch.setattr(tp.StereoToPose, "step", interrupted)
+        assert infer_main(command) == 130
+    assert "goes on" in capsys.readouterr().err
+    assert not (tmp_path / "poses.csv").exists()
+    seen = []
+    monkeypatch.setattr(tp.StereoToPose, "step", lambda s, r, p: seen.append(p) or step(s, r, p))
+    # The output folder is not what makes a run the same: the settings and the recording are.
+    assert infer_main(command) == 0
+    assert seen == list(range(2, FRAMES))
+    again, whole = tp.read_poses_csv(tmp_path / "poses.csv"), tp.read_poses_csv(result / "poses.csv")
+    assert again.status == whole.status
+    torch.testing.assert_close(again.joints, whole.joints, atol=1e-3, rtol=0, equal_nan=True)
+
+
+def test_other_settings_start_over(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    model = tp.StereoToPose(tp.open_recording(folder).camera)
+    run = session.Session(model, tp.open_recording(folder), tmp_path, {"a": 1}, "1")
+    assert run._resume(fresh=False) == 0
+    (run.parts / "poses_00000002.npz").write_bytes(b"")
+    other = session.Session(model, tp.open_recording(folder), tmp_path, {"a": 2}, "1")
+    assert other._resume(fresh=False) == 0
+    assert not list(run.parts.glob("poses_*"))
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("registration/*.yaml")), ids=lambda path: path.stem)
+def test_every_registration_config_runs_for_a_step(path: Path, folder: Path, tmp_path: Path):
+    command = [f"recording={folder}", f"output={tmp_path}", f"registration={path.stem}", "max_frames=1", *QUICK]
+    assert infer_main(command) == 0
+    assert len(rows(tmp_path)) == 1
+
+
+def test_a_depth_camera_s_recording_runs_too(synthetic: SyntheticRecording, tmp_path: Path):
+    """The renderer's true depth as a depth camera would give it, the empty room learned from the recording."""
+    camera = tp.StereoCamera(**{**vars(synthetic.camera), "baseline": None})
+    shots = [frame for _, frame in zip(range(2), synthetic, strict=False)]
+    room = shots[0].depth[0].clone()
+    room[shots[0].mask[0]] = torch.nan  # where the person stands, the background is not known
+    frames = [tp.Frame(i, i / 10, depth=shot.depth[0]) for i, shot in enumerate(shots)]
+    write_recording(tmp_path / "depth", camera, frames, Backgrounds(depth=room[None]))
+    output = tmp_path / "out"
+    assert infer_main([f"recording={tmp_path / 'depth'}", f"output={output}", *QUICK]) == 0
+    sequence = tp.read_poses_csv(output / "poses.csv")
+    assert all(sequence.answered)
+    assert (sequence.joints - synthetic.joints[:2].to(sequence.joints))[:, 3:].norm(dim=-1).mean() < 0.08
+
+
+def damage(folder: Path, kind: str) -> None:
+    calibration = folder / "calibration.yaml"
+    if kind == "unequal counts":
+        (folder / "right" / "000003.png").unlink()
+    elif kind == "wrong size":
+        for side in ("left", "right"):
+            cv2.imwrite(str(folder / side / "000000.png"), np.zeros((100, 100, 3), np.uint8))
+    elif kind == "missing value":
+        calibration.write_text(re.sub(r"baseline.*\n", "", calibration.read_text()))
+    elif kind == "senseless value":
+        calibration.write_text(re.sub(r"focal_length.*\n", "focal_length: -3\n", calibration.read_text()))
+    else:
+        raise AssertionError(kind)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("unequal counts", ("left", "right")),
+        ("wrong size", ("320", "100")),
+        ("missing value", ("baseline",)),
+        ("senseless value", ("focal_length", "-3")),
+    ],
+)
+def test_a_bad_recording_is_one_sentence_and_nothing_is_written(
+    kind: str, words: tuple[str, ...], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(folder, tmp_path / "bad")
+    damage(tmp_path / "bad", kind)
+    assert infer_main([f"recording={tmp_path / 'bad'}", f"output={tmp_path / 'out'}"]) == 2
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("error: ")
+    assert "\n" not in message
+    assert all(word in message for word in words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_folder_and_an_unknown_setting_are_one_sentence(capsys: pytest.CaptureFixture[str]):
+    assert infer_main(["recording=/nowhere/at/all"]) == 2
+    assert "/nowhere/at/all" in capsys.readouterr().err
+    assert infer_main(["pose.registration.round=3"]) == 2
+    assert "did you mean 'rounds'?" in capsys.readouterr().err
+
+
+def test_the_readme_s_commands_are_real():
+    """Every command of the README names a script, a benchmark or a target that exists, with settings that are known."""
+    root = CONFIGS.parent
+    readme = (root / "README.md").read_text()
+    commands = re.findall(r"^(?:OMP_NUM_THREADS=1 )?((?:python|make) .*?)(?:\s+#.*)?$", readme, re.M)
+    assert len(commands) >= 6
+    for command in commands:
+        words = command.split()
+        if words[0] == "make":
+            assert f"\n{words[1]}:" in (root / "Makefile").read_text(), command
+        elif words[1] == "-m":
+            assert (root / Path(*words[2].split("."))).with_suffix(".py").is_file(), command
+        else:
+            kind = words[1].removesuffix(".py")
+            load_config(kind, [word for word in words[2:] if "=" in word])  # raises for an unknown setting
