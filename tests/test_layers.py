@@ -34,7 +34,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "learning": ("part_network", "training"),
     "the desk": (
         *("calibration", "recording", "rendered", "export", "figures"),
-        *("pipeline", "session", "study", "cli"),
+        *("pipeline", "session", "clips", "study", "cli"),
     ),
 }
 ORDER = [

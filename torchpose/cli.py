@@ -1,19 +1,34 @@
 """The command line: settings as `key=value`, checked before anything runs, and errors of one sentence."""
 
 import inspect
+import math
+import shutil
 import sys
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import torch
 
+from torchpose.activity.dataset import Clip, Fold, Split, read_skeletons, split_clips
+from torchpose.activity.features import FeatureKind
+from torchpose.activity.recognizer import RecognizerConfig
+from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
 from torchpose.session import Session, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups, describe
+from torchpose.study import (
+    THESIS_ACCURACY,
+    count_material,
+    run_study,
+    study_notes,
+    study_table,
+    write_study,
+)
 from torchpose.version import __version__
 
 PACKAGE = Path(__file__).resolve().parent
@@ -52,11 +67,31 @@ class TrainConfig:
 
     output: str = "runs/train"  # folder for the results
     fresh: bool = False  # start over instead of continuing an interrupted run
-    seed: int = 0  # the same seed gives the same results
-    device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
+    seed: int = 0  # of the recogniser's starts; the same seed gives the same results
+    device: str = "cpu"  # where to observe the recordings: cpu, cuda, cuda:1, mps
     threads: int = 1  # of the processor; more help only where cores are idle
+    workers: int = 2  # processes that make the database, each with one thread and up to 0.7 GB of memory
+    # feature sets to compare: angles, directions, pca, ica; of a skeleton data set: skeleton
+    features: tuple[FeatureKind, ...] = (FeatureKind.pca, FeatureKind.ica, FeatureKind.angles)
+    split: Split = Split.half_subjects  # of a skeleton data set; our own has test people of its own
+    data: DataConfig = field(default_factory=DataConfig)
+    recognizer: RecognizerConfig = field(default_factory=RecognizerConfig)
+    eyes: EyesConfig = field(default_factory=EyesConfig)
+    pose: PoseConfig = field(default_factory=PoseConfig)
 
     def __post_init__(self) -> None:
+        if not self.features or len(set(self.features)) < len(self.features):
+            names = ", ".join(kind.value for kind in self.features)
+            raise ValueError(f"features must be one or more, each once, got {names or 'none'}; name some")
+        if self.workers < 1:
+            raise ValueError(
+                f"workers must be at least 1, got {self.workers}; one for each idle core is good"
+            )
+        if self.recognizer.feature.kind is not FeatureKind.angles or self.recognizer.seed != 0:
+            raise ValueError(
+                "recognizer.feature.kind and recognizer.seed must be left alone, as each of `features` and `seed` take "
+                f"their places, got {self.recognizer.feature.kind.value} and {self.recognizer.seed}"
+            )
         _check_machine(self.seed, self.threads)
 
 
@@ -117,7 +152,45 @@ def infer(config: InferConfig, device: torch.device) -> None:
 
 def train(config: TrainConfig, device: torch.device) -> None:
     """Train and score the activity recogniser, and write and print the results."""
-    raise NotImplementedError
+    begin = time.perf_counter()
+    clips, folds, notes = _material(config, device)
+    prepared = time.perf_counter() - begin
+    scores = run_study(clips, folds, config.features, replace(config.recognizer, seed=config.seed))
+    about = {
+        "version": __version__,
+        "settings": settings_of(config),
+        "seed": config.seed,
+        "data": count_material(clips, folds) | notes,
+        "seconds": {"data": prepared, "all": time.perf_counter() - begin},
+    }
+    output = Path(config.output)
+    write_study(output, scores, about)
+    thesis = THESIS_ACCURACY if config.data.path is None else {}
+    print(study_table(scores, thesis, shutil.get_terminal_size().columns))
+    print(f"\n{study_notes(about)}\nresults        {output}/ results.json, recognizers/")
+
+
+def _material(
+    config: TrainConfig, device: torch.device
+) -> tuple[Sequence[Clip], Sequence[Fold], dict[str, float]]:
+    """The clips, how they are divided, and what is known of their quality."""
+    of_skeletons = [kind is FeatureKind.skeleton for kind in config.features]
+    names = ", ".join(kind.value for kind in config.features)
+    if config.data.path is None:
+        if any(of_skeletons):
+            raise ValueError(
+                f"data.path must be a skeleton data set for the features [{names}], got null; give data.path=FILE.npz, "
+                "or other features"
+            )
+        maker = ClipMaker(config.data, config.eyes, config.pose, str(device))
+        database = build_database(maker, config.workers, config.fresh)
+        return database.clips, [database.fold], {"angle_error_deg": math.degrees(database.mean_angle_error)}
+    if not all(of_skeletons):
+        raise ValueError(
+            f"features must be [skeleton] for a skeleton data set, got [{names}]; add experiment=skeleton"
+        )
+    clips = read_skeletons(config.data.path)
+    return clips, split_clips(clips, config.split), {}
 
 
 def run_command(kind: Kind, argv: Sequence[str], action: Callable[[Any, torch.device], None]) -> int:
@@ -138,7 +211,8 @@ def run_command(kind: Kind, argv: Sequence[str], action: Callable[[Any, torch.de
         print("\ninterrupted: the same command again goes on where this one stopped", file=sys.stderr)
         return INTERRUPTED
     except OSError as error:
-        print(f"error: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        reason = f"{error.filename}: {error.strerror}" if error.filename else error
+        print(f"error: {reason}", file=sys.stderr)
         return BAD_INPUT
     except ValueError as error:
         if not _raised_by_the_package(error):
