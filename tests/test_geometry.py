@@ -88,6 +88,12 @@ class TestLeftJacobian:
             slope = (exp_rotation(v + d) - exp_rotation(v - d)) / (2 * h)
             assert_close(slope, hat(J[:, k]) @ R, atol=1e-8, rtol=0)
 
+    @given(rotation_vectors)
+    def test_closes_with_the_rotation(self, v: Tensor) -> None:
+        """exp(v) - 1 = hat(v) J(v), to rounding: finite differences cannot see the small angles' series."""
+        gap = exp_rotation(v) - torch.eye(3, dtype=F64) - hat(v) @ left_jacobian(v)
+        assert gap.abs().max() < 1e-15 * (1 + v.norm())
+
     def test_equals_its_integral(self) -> None:
         """J = integral of exp(s v) over s in [0, 1], by Gauss-Legendre's rule."""
         v = vector(1.1, -0.7, 2.0)

@@ -170,6 +170,21 @@ class TestOtherFiles:
         assert bodies["forearm_left"].origin.default() == (0.01, 0.4, 0.02)
         assert bodies["forearm_right"].origin.default() == (-0.01, 0.4, 0.02)
 
+    def test_slants_are_mirrored(self, tmp_path: Path) -> None:
+        """Segments, limbs and rests of the built-in person lie in planes that the mirror keeps; others need not."""
+
+        def slanted(data: Body) -> None:
+            data["segments"]["foot"]["axis"] = [0.6, 0.0, -0.8]
+            data["bodies"]["shank"] |= {"limb": [0.6, 0.8, 0.0], "rest": [0.8, 0.6, 0.0]}
+
+        skeleton = load_skeleton(write(tmp_path, slanted))
+        axis = {segment.name: segment.axis for segment in skeleton.segments}
+        assert axis["foot_left"] == pytest.approx((0.6, 0, -0.8))
+        assert axis["foot_right"] == pytest.approx((-0.6, 0, -0.8))
+        shank = next(body for body in skeleton.bodies if body.name == "shank_right")
+        assert shank.limb == pytest.approx((-0.6, 0.8, 0))
+        assert shank.rest == pytest.approx((-0.8, 0.6, 0))
+
     def test_a_vector_of_several_sizes_adds_up(self, tmp_path: Path) -> None:
         def both(data: Body) -> None:
             data["bodies"]["head"]["origin"] = {"trunk": [0, -0.5, 0.125], "neck": [0, -0.25, 0]}
