@@ -134,7 +134,7 @@ class ClipMaker:
     def find(self, planned: PlannedClip) -> ObservedClip | None:
         """The clip in the cache; None where it is not there or its file is damaged."""
         try:
-            with np.load(self.path(planned)) as archive:
+            with self.path(planned).open("rb") as file, np.load(file) as archive:
                 pose, directions, silhouettes, error = (torch.from_numpy(archive[name]) for name in _ARRAYS)
         except (FileNotFoundError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
