@@ -25,8 +25,7 @@ from torchpose.registration.vem import (
 from torchpose.vision.points import group_cells
 
 DEGREES = torch.pi / 180
-# Far from the answer the silhouette draws limbs over one another: from there the points alone.
-FROM_AFAR = RegistrationConfig(rounds=10, sigma_first=0.15, rim=RimConfig(weight=0.0))
+FROM_AFAR = RegistrationConfig(rounds=10, sigma_first=0.15)
 
 
 @pytest.fixture(scope="module")

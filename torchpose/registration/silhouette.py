@@ -16,17 +16,26 @@ from torchpose.body.model import PosedBody
 from torchpose.registration.fitting import Rows
 from torchpose.vision.camera import StereoCamera
 
+MARGIN = 1.0  # px beside the mask that are its edge's own width
+
 
 @dataclass(frozen=True)
 class RimConfig:
     weight: float = 1.0  # of the whole term against the points; 0 switches it off
     sd: float = 0.02  # m, by which a rim may stand out of the mask
+    last_rounds: int = (
+        2  # of a registration that it takes part in: far from the answer it draws limbs over others
+    )
     rim_points: int = 12  # per part
     reach: float = 0.25  # m, no stronger pull than from here: a mask without a limb must not tear one off
 
     def __post_init__(self) -> None:
         if self.weight < 0 or not self.sd > 0 or self.rim_points < 3 or not self.reach > 0:
             raise ValueError(f"weight >= 0, sd > 0, rim_points >= 3 and reach > 0 must hold, got {self}")
+        if self.last_rounds < 1:
+            raise ValueError(
+                f"last_rounds must be at least 1, got {self.last_rounds}; weight=0 switches it off"
+            )
 
 
 def nearest_inside(mask: Bool[Tensor, "batch height width"]) -> Float[Tensor, "batch height width 2"]:
@@ -58,7 +67,8 @@ def silhouette_rows(
     """A row for each rim point of each part: where it projects beside the mask, the mask's edge draws it.
 
     `nearest` comes from `nearest_inside`. Points outside the image or within a pixel of the mask give empty
-    rows.
+    rows, and the others are drawn to that pixel's distance, so that a row begins at zero: with a jump there, an
+    identical frame moved the joints by 8 mm every time.
     """
     B, K = posed.centers.shape[:2]
     points = outline(posed, config.rim_points)
@@ -77,12 +87,12 @@ def silhouette_rows(
     # From whole pixel to whole pixel: what rounding leaves of the rest must not turn the way.
     unit = torch.nn.functional.normalize(index - goal, dim=-1)
     length = ((pixel - goal) * unit).sum(-1)
-    outside = seen & (length > 1)
+    outside = seen & (length > MARGIN)
     # Along the ray the rim may move freely: the direction is that of the image plane, across the ray.
     across = torch.cat([unit, -(unit * points[..., :2]).sum(-1, keepdim=True) / depth[..., None]], -1)
-    metres = length * depth / camera.focal_length
+    metres = (length - MARGIN) * depth / camera.focal_length
     pull = (config.reach / metres.clamp_min(config.reach)) * (config.weight**0.5 / config.sd)
-    target = camera.back_project(goal, depth)
+    target = camera.back_project(goal + MARGIN * unit, depth)
     return Rows(part, local, target, across * (outside * pull)[..., None])
 
 

@@ -49,6 +49,7 @@ class RegistrationConfig:
         0.5  # rad, of the pull towards the rest pose on joints that nothing is seen of; 0 is none
     )
     rest_support: float = 5.0  # points on a limb that halve this pull
+    rest_penalty: float = 0.0004  # m of misfit per rad^2 of all joints: of two poses that fit, the usual one is taken
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
     rim: RimConfig = field(default_factory=RimConfig)
@@ -59,7 +60,7 @@ class RegistrationConfig:
         for name in ("sigma_first", "sigma_last", "noise_sd", "effective_points", "rest_support"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("outlier", "robust_sd", "rest_sd", "tangential"):
+        for name in ("outlier", "robust_sd", "rest_sd", "rest_penalty", "tangential"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
 
@@ -104,7 +105,7 @@ class Registration:
     ]  # q(label) of each point; the last label is "no part" where there is one
     distance: Float[Tensor, "batch num"]  # m, to the nearest part; 0 on padding
     point_to_model: Float[Tensor, " batch"]  # m, (5.2): the mean of `distance` over the points
-    misfit: Float[Tensor, " batch"]  # m, capped distance of the points plus overhang: compares starts
+    misfit: Float[Tensor, " batch"]  # m, capped distances plus overhang plus `rest_penalty`: compares starts
     bound: Float[Tensor, "rounds batch"]  # (C.8) after each VE-step, at that round's sigma
     status: Int[Tensor, " batch"]  # of the last M-step, see `Status`
 
@@ -147,7 +148,8 @@ class Registrar(nn.Module):
             foot = self.correspond(posed, observation)
             labelling = self.label(posed, foot, observation, sigma)
             bounds.append(labelling.bound[-1])
-            rows, support = self.rows(posed, foot, labelling, observation)
+            rim = i >= rounds - config.rim.last_rounds
+            rows, support = self.rows(posed, foot, labelling, observation, rim)
             full = self.with_rest(prior, support)
             solution = fit_pose(self.body, pose, size, rows, full, config.fitting)
             pose, status = solution.value, solution.status
@@ -173,16 +175,21 @@ class Registrar(nn.Module):
         )
 
     def rows(
-        self, posed: PosedBody, foot: FootPoint, labelling: Labelling, observation: Observation
+        self,
+        posed: PosedBody,
+        foot: FootPoint,
+        labelling: Labelling,
+        observation: Observation,
+        rim: bool = True,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """The M-step's rows from beliefs, and how many points support each part."""
+        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
         belief = labelling.belief[:, : self.body.num_parts]
         if self.config.hard:
             best = labelling.belief.argmax(1, keepdim=True)
             belief = torch.zeros_like(labelling.belief).scatter(1, best, 1.0)[:, : self.body.num_parts]
             belief = belief * observation.cloud.mask[:, None]
         rows = self._point_rows(posed, foot, belief, observation.cloud)
-        if self.config.rim.weight > 0:
+        if rim and self.config.rim.weight > 0:
             across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.rim)
             # Rims of one part move together, so they count as a few independent measurements, not as many.
             rows = Rows.cat(rows, across)
@@ -259,6 +266,7 @@ class Registrar(nn.Module):
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.distance.amin(1) * cloud.mask
         misfit = nearest.clamp_max(0.2).sum(1) / count
+        misfit = misfit + config.rest_penalty * ((pose[:, 6:] - self.body.rest) ** 2).sum(1)
         if config.rim.weight > 0:
             misfit = misfit + overhang(posed, observation.nearest, observation.camera, config.rim)
         return Registration(
