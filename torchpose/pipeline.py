@@ -137,9 +137,7 @@ class Eyes(nn.Module):
         if self.camera.baseline is None:
             depth = backgrounds.depth
             if depth is None:
-                depth = _stack([frame.depth for frame in _readable(recording, spread)])
-                # Whoever walks through stands before the scene, so of all readings the far ones are the scene's.
-                depth = torch.nanquantile(depth, 0.9, dim=0)[None]
+                depth = far_readings(_stack([frame.depth for frame in _readable(recording, spread)]))
             self.background = DepthBackground(depth.to(device), self.config.depth_background)
             self.background_depth = self.background.depth
             return
@@ -335,6 +333,16 @@ class StereoToPose(nn.Module):
             pose=spread(pose),
             pose_covariance=spread(covariance),
         )
+
+
+def far_readings(depth: Float[Tensor, "num height width"]) -> Float[Tensor, "num height width"]:
+    """The readings of each pixel that are the empty scene's, NaN elsewhere, m: those near the farthest.
+
+    Whoever walks through stands before the scene. The farthest reading itself is noise's choice, so the tenth from
+    the far end stands for it, and what lies within the noise of a depth camera around it belongs to it.
+    """
+    far = torch.nanquantile(depth, 0.9, dim=0)
+    return torch.where(depth > far - (0.05 + 0.01 * far**2), depth, torch.nan)
 
 
 def _upright_extent(sight: Sight) -> float:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
+from torchpose.geometry import exp_rotation
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
 from torchpose.vision.faces import Faces
@@ -36,6 +37,8 @@ LEGS = (
     ((0.1, 0.9, 0.3), (0.05, 0.6, 0.8)),
     ((0.6, 0.8, -0.2), (0.2, 1.0, 0.0)),
 )
+# Sitting, crouching and stepping back, each with the lean of the trunk that goes with it, rad.
+BENT = ((ARMS[1], LEGS[1], 0.2), (ARMS[1], LEGS[2], 0.35), (ARMS[6], LEGS[2], 0.35), (ARMS[1], LEGS[3], 0.1))
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class StartConfig:
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
-    face_yaws: tuple[float, ...] = (-65.0, -25.0, 25.0, 65.0)  # degrees, tried when a face is seen
+    face_yaws: tuple[float, ...] = (-75.0, -35.0, 0.0, 35.0, 75.0)  # degrees, tried when a face is seen
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
     back_penalty: float = 0.004  # m of misfit that a pose turned away from the camera must make good
 
@@ -121,15 +124,22 @@ class Starter(nn.Module):
     def hypotheses(
         self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
     ) -> Float[Tensor, "starts parameters"]:
-        """Poses to start from: headings x arms, standing, and a few sitting."""
+        """Poses to start from: headings x arms, standing, and a few with bent legs."""
         yaws = self.config.face_yaws if bool(faces.found[0]) else self.config.yaws
-        limbs = [(arm, LEGS[0]) for arm in ARMS] + [(ARMS[1], leg) for leg in LEGS[1:3]]
-        directions = torch.stack([_directions(arm, leg) for arm, leg in limbs]).to(size)
+        poses = [(arm, LEGS[0], 0.0) for arm in ARMS] + [(arm, leg, lean) for arm, leg, lean in BENT]
+        directions = torch.stack([_directions(arm, leg) for arm, leg, _ in poses]).to(size)
+        lean = torch.tensor([lean for _, _, lean in poses]).to(size)
         heading = torch.tensor([radians(yaw) for yaw in yaws]).to(size)
-        Y, L = len(heading), len(limbs)
-        root = torch.zeros(Y * L, 3).to(size)
-        root[:, 0] = heading.repeat_interleave(L)
+        Y, L = len(heading), len(poses)
+        zero = torch.zeros(Y * L).to(size)
+        root = torch.stack([heading.repeat_interleave(L), lean.repeat(Y), zero], 1)
+        # Whoever leans by an angle has the hips behind and higher up, seen from the head.
+        away = torch.stack([zero, zero, torch.ones_like(zero)], -1)
+        back = (exp_rotation(torch.stack([zero, root[:, 0], zero], -1)) @ away[..., None])[..., 0]
         pelvis = pelvis_position(observation.cloud, faces, size, self.body).expand(Y * L, 3)
+        trunk = 0.65 * size[0, 0]
+        pelvis = pelvis + trunk * root[:, 1:2].sin() * back
+        pelvis = pelvis - trunk * (1 - root[:, 1:2].cos()) * torch.tensor([0.0, 1.0, 0.0]).to(size)
         return self.body.pose_from_directions(pelvis, root, directions.repeat(Y, 1, 1))
 
     def variations(self, pose: Float[Tensor, "1 parameters"]) -> Float[Tensor, "starts parameters"]:

@@ -3,6 +3,7 @@
 Times are in seconds, poses in metres and radians. The next frame starts from the last (T. 3.2.2).
 """
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -37,8 +38,10 @@ class TrackingConfig:
     joint_speed_sd: float = 8.0  # rad/s by which a joint departs from the prediction
     root_speed_sd: float = 2.0  # m/s and rad/s, the same for the root
     accept_misfit: float = 0.055  # m: a pose that fits worse is none
+    doubt_misfit: float = 0.030  # m: a pose that fits worse is also sought anew, and given up for a clearly better one
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.03  # of the points straying: a limb may be lost, and is sought elsewhere
+    retry: float = 0.25  # s after a search that found nothing better, before the next one
     memory: float = 2.0  # s after which a lost person is forgotten
 
     def __post_init__(self) -> None:
@@ -48,8 +51,10 @@ class TrackingConfig:
             "joint_speed_sd",
             "root_speed_sd",
             "accept_misfit",
+            "doubt_misfit",
             "stray_distance",
             "stray_share",
+            "retry",
             "memory",
         ):
             if not getattr(self, name) > 0:
@@ -81,6 +86,7 @@ class Tracker(nn.Module):
         self._velocity: Tensor | None = None  # per second
         self._time = 0.0
         self._known_stray = 0.0
+        self._failed = -math.inf  # when a search last found nothing, s
 
     def state(self) -> dict[str, Tensor]:
         """What the next frame starts from, as tensors; empty where nothing is remembered."""
@@ -123,8 +129,11 @@ class Tracker(nn.Module):
         if observation is None or faces is None:
             return TrackedFrame(TrackStatus.absent, None)
         if self._pose is None:
+            if 0 <= time_s - self._failed < self.config.retry:
+                return TrackedFrame(TrackStatus.entering, None)
             found = self.starter(observation, faces, size)
             if not self.acceptable(found):
+                self._failed = time_s
                 return TrackedFrame(TrackStatus.entering, None)
             self._remember(found, time_s)
             return TrackedFrame(TrackStatus.partial if cut else TrackStatus.tracked, found)
