@@ -124,7 +124,9 @@ def test_hypotheses_stand_at_the_person_in_every_heading(body, starter):
     assert set((seen[:, 3].rad2deg().round()).tolist()) == set(starter.config.face_yaws)
     assert len(blind) == len(seen) / len(starter.config.face_yaws) * len(starter.config.yaws)
     for starts in (blind, seen):
-        assert ((starts[:, :3] - pose[:, :3]).norm(dim=-1) < 0.15).all()  # m
+        away = (starts[:, :3] - pose[:, :3]).norm(dim=-1)
+        assert away.median() < 0.15  # m
+        assert away.max() < 0.5  # whoever sits has the hips elsewhere
 
 
 @pytest.mark.parametrize("face", [True, False])

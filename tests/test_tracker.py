@@ -98,16 +98,25 @@ def test_a_life(scripted, step):
     starter.misfit = BAD
     assert step(tracker, 0.05).status is TrackStatus.entering
     starter.misfit = GOOD
-    assert step(tracker, 0.1).status is TrackStatus.tracked
-    assert step(tracker, 0.15).status is TrackStatus.tracked
+    later = 0.06 + CONFIG.retry  # a search in vain is not repeated at once
+    assert step(tracker, later).status is TrackStatus.tracked
+    assert step(tracker, later + 0.05).status is TrackStatus.tracked
     registrar.misfit = starter.misfit = BAD
-    assert step(tracker, 0.2).status is TrackStatus.lost
+    assert step(tracker, later + 0.1).status is TrackStatus.lost
     starter.misfit = GOOD
-    assert step(tracker, 0.25).status is TrackStatus.recovered
+    assert step(tracker, later + 0.15).status is TrackStatus.recovered
     registrar.misfit = GOOD
-    assert step(tracker, 0.3).status is TrackStatus.tracked
-    assert step(tracker, 0.35, present=False).status is TrackStatus.absent
-    assert step(tracker, 0.4).status is TrackStatus.tracked
+    assert step(tracker, later + 0.2).status is TrackStatus.tracked
+    assert step(tracker, later + 0.25, present=False).status is TrackStatus.absent
+    assert step(tracker, later + 0.3).status is TrackStatus.tracked
+
+
+def test_a_cold_start_in_vain_is_not_repeated_at_once(scripted, step):
+    tracker, _, starter = scripted
+    starter.misfit = BAD
+    for time_s in (0.0, 0.4 * CONFIG.retry, 0.9 * CONFIG.retry, 1.1 * CONFIG.retry):
+        assert step(tracker, time_s).status is TrackStatus.entering
+    assert starter.calls == ["cold", "cold"]
 
 
 def test_a_person_cut_by_the_border_is_partial(scripted, step):
@@ -189,7 +198,7 @@ def test_an_answer_that_is_not_finite_is_none(scripted, step, body):
     starter.status = Status.NON_FINITE
     assert step(tracker, 0.0).status is TrackStatus.entering
     starter.status, starter.pose = Status.CONVERGED, torch.full((1, 24), torch.nan)
-    assert step(tracker, 0.1).status is TrackStatus.entering
+    assert step(tracker, 2 * CONFIG.retry).status is TrackStatus.entering
 
 
 def test_forgetting_starts_over_and_begin_takes_a_known_pose(scripted, step, body):

@@ -258,10 +258,12 @@ class StereoToPose(nn.Module):
     def measure_size(self, sights: list[Sight]) -> Float[Tensor, "1 sizes"]:
         """Lengths and girths of the person in these frames; the body file's where no pose is found in any."""
         size = self.body.size_of_height(self.config.height or self.measure_height(sights))
+        if self.config.size.rounds == 0:
+            return size
         seen = [(self.observe(sight), sight.faces) for sight in sights if sight.present]
         found = [(observation, self.tracker.starter(observation, faces, size)) for observation, faces in seen]
         found = [(observation, fit) for observation, fit in found if self.tracker.acceptable(fit)]
-        if not found or self.config.size.rounds == 0:
+        if not found:
             return size
         observation = stack_observations([observation for observation, _ in found])
         poses = torch.cat([fit.pose for _, fit in found])
