@@ -321,6 +321,28 @@ def test_every_switch_still_finds_the_pose(scene, switch):
     assert found.bound.isfinite().all()
 
 
+def test_sigma_falls_geometrically_and_the_silhouette_comes_last(scene):
+    body, pose, view = scene
+
+    class Watched(Registrar):
+        def label(self, posed, foot, observation, sigma):
+            sigmas.append(sigma)
+            return super().label(posed, foot, observation, sigma)
+
+        def rows(self, posed, foot, labelling, observation, rim=True):
+            rims.append(rim)
+            return super().rows(posed, foot, labelling, observation, rim)
+
+    sigmas, rims = [], []
+    config = RegistrationConfig(rounds=3, sigma_first=0.08, sigma_last=0.02, rim=RimConfig(last_rounds=1))
+    Watched(body, config)(view.observation(), pose, body.default_size(1))
+    assert sigmas == pytest.approx([0.08, 0.04, 0.02, 0.02])  # the last one is for the answer itself
+    assert rims == [False, False, True, True]
+    sigmas, rims = [], []
+    Watched(body, config)(view.observation(), pose, body.default_size(1), rounds=2, sigma_first=0.5)
+    assert sigmas == pytest.approx([0.5, 0.02, 0.02])
+
+
 def test_jacobians_agree_on_the_answer(scene):
     body, pose, view = scene
     start = off(pose, 4, 1)
