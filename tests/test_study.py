@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose import clips
 from torchpose.activity.codebook import CodebookConfig
 from torchpose.activity.dataset import Clip, Fold, Split, split_clips
 from torchpose.activity.features import FeatureConfig, FeatureKind
@@ -22,6 +23,7 @@ from torchpose.registration.start import StartConfig
 from torchpose.rendered import RenderedRecording
 from torchpose.study import THESIS_ACCURACY, FeatureScore, count_material, run_study, study_table
 from torchpose.synthesis.database import DatabaseConfig, PlannedClip, plan_database
+from torchpose.version import __version__
 from torchpose.vision.background import SilhouetteConfig
 
 BODY = BodyModel()
@@ -167,7 +169,7 @@ def test_what_is_in_the_cache_is_not_made_again(tmp_path: Path, stand_in: Maker)
     assert len(stand_in.made) == 16
 
 
-def test_a_clips_file_is_named_after_all_that_it_depends_on(monkeypatch: pytest.MonkeyPatch):
+def test_a_clips_file_is_named_after_all_that_it_depends_on():
     maker = ClipMaker()
     names = {maker.path(SEEN).name}
     changed = [
@@ -177,10 +179,31 @@ def test_a_clips_file_is_named_after_all_that_it_depends_on(monkeypatch: pytest.
         replace(maker, data=DataConfig(database=DatabaseConfig(width=640))),
     ]
     names |= {other.path(SEEN).name for other in changed}
-    names |= {maker.path(replace(SEEN, take=2)).name}
-    assert len(names) == 6
-    monkeypatch.setattr("torchpose.clips.__version__", "another")
-    assert maker.path(SEEN).name not in names
+    names |= {maker.path(replace(SEEN, take=2)).name, replace(maker, version="another").path(SEEN).name}
+    assert len(names) == 7
+
+
+def test_changed_code_makes_new_clips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    code = {"clips.py": "a", "body/human.yaml": "b", "activity/hmm.py": "c", "study.py": "d"}
+    for name, text in code.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr("torchpose.clips.__file__", str(tmp_path / "clips.py"))
+
+    def version() -> str:
+        clips._code_version.cache_clear()
+        return ClipMaker().version
+
+    first = version()
+    assert first.startswith(__version__)
+    for name in ("activity/hmm.py", "study.py"):
+        (tmp_path / name).write_text("changed")
+    assert version() == first
+    (tmp_path / "body/human.yaml").write_text("changed")
+    second = version()
+    (tmp_path / "clips.py").write_text("changed")
+    assert len({first, second, version()}) == 3
+    clips._code_version.cache_clear()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 What a clip holds is estimated from the images; the truth serves only to say how far off the estimates are. Radians.
 """
 
+import functools
+import hashlib
 import json
 import multiprocessing
 import signal
@@ -31,6 +33,8 @@ from torchpose.session import settings_of
 from torchpose.synthesis.database import DatabaseConfig, PlannedClip, plan_database
 from torchpose.version import __version__
 
+# What comes after the clips, and does not change them.
+_AFTER_CLIPS = ("activity/", "configs/", "cli.py", "export.py", "figures.py", "session.py", "study.py")
 _ARRAYS = ("pose", "directions", "silhouettes", "angle_error")  # of a clip's file
 
 
@@ -75,6 +79,18 @@ class Database:
         return float(torch.cat([observed.angle_error for observed in self.observed]).nanmean())
 
 
+@functools.cache
+def _code_version() -> str:
+    """The package's version and a digest of the code that makes clips, so that whoever changes it gets new ones."""
+    package = Path(__file__).resolve().parent
+    digest = hashlib.sha256()
+    for path in sorted((*package.rglob("*.py"), *package.rglob("*.yaml"))):
+        name = path.relative_to(package).as_posix()
+        if not name.startswith(_AFTER_CLIPS):
+            digest.update(f"{name}\n".encode() + path.read_bytes())
+    return f"{__version__}+{digest.hexdigest()[:16]}"
+
+
 @dataclass(frozen=True)
 class ClipMaker:
     """Everything that a clip depends on; goes whole to another process."""
@@ -83,11 +99,12 @@ class ClipMaker:
     eyes: EyesConfig = field(default_factory=EyesConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     device: str = "cpu"
+    version: str = field(default_factory=_code_version)  # of the code that runs
 
     def path(self, planned: PlannedClip) -> Path:
         """Where the cache keeps a clip: the name changes with the version and with all that the clip depends on."""
         settings = [settings_of(self.eyes), settings_of(self.pose), self.data.silhouette_height]
-        key = planned.key(self.data.database, __version__, *map(json.dumps, settings))
+        key = planned.key(self.data.database, self.version, *map(json.dumps, settings))
         return Path(self.data.cache) / f"{key}.npz"
 
     @torch.no_grad()
