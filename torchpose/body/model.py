@@ -213,6 +213,8 @@ class BodyModel(nn.Module):
             R[:, self.joint_bodies], self.joint_basis @ size[:, None, :, None]
         )
         radii = (self.radius_basis @ size[:, None, :, None])[..., 0].expand(B, -1, -1)
+        # A stout person's segment may grow as thick as it is long, but a spheroid's long axis stays the long one.
+        radii = torch.stack([radii[..., 0], torch.maximum(radii[..., 0], radii[..., 1])], -1)
         return PosedBody(
             R,
             t,

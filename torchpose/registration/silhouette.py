@@ -23,9 +23,7 @@ MARGIN = 1.0  # px beside the mask that are its edge's own width
 class RimConfig:
     weight: float = 1.0  # of the whole term against the points; 0 switches it off
     sd: float = 0.02  # m, by which a rim may stand out of the mask
-    last_rounds: int = (
-        2  # of a registration that it takes part in: far from the answer it draws limbs over others
-    )
+    last_rounds: int = 2  # in which it takes part: far from the answer it draws limbs over others
     rim_points: int = 12  # per part
     reach: float = 0.25  # m, no stronger pull than from here: a mask without a limb must not tear one off
 

@@ -17,6 +17,9 @@ from torchpose.registration.fitting import PosePrior, Rows, linearize_by_screws
 from torchpose.registration.vem import Observation, Registrar
 from torchpose.vision.points import PointCloud
 
+# Factors on the body file's person that no grown-up or half-grown person leaves.
+SMALLEST, LARGEST = 0.6, 1.5
+
 
 @dataclass(frozen=True)
 class SizeConfig:
@@ -73,6 +76,7 @@ def fit_size(
         start = torch.cat([pose.flatten(), size[0]])[None]
         solution = levenberg_marquardt(problem.linearize, start, LMConfig(max_steps=config.lm_steps))
         pose, size = problem.split(solution.value)
+        size = size.clamp(SMALLEST, LARGEST)
     return size, pose
 
 

@@ -36,20 +36,14 @@ class RegistrationConfig:
     distance: Distance = Distance.euclidean
     visible: bool = True  # correspond with the side that the camera sees
     outlier: float = 3.0  # sigmas beyond which a point rather has no part; 0 gives every point a part
-    hard: bool = (
-        True  # each point answers to its best label alone; soft costs 14 times the rows and gains nothing
-    )
-    tangential: float = (
-        0.3  # weight of the residual along the surface; 1 is the Euclidean distance to a fixed foot
-    )
+    hard: bool = True  # each point answers to its best label alone; soft costs 14 times the rows
+    tangential: float = 0.3  # weight of the residual along the surface; 1: the distance to a fixed foot
     robust_sd: float = 0.05  # m, at which a residual loses three quarters of its weight; 0 weighs all alike
     noise_sd: float = 0.02  # m, of a point in the M-step
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
-    rest_sd: float = (
-        0.5  # rad, of the pull towards the rest pose on joints that nothing is seen of; 0 is none
-    )
+    rest_sd: float = 0.5  # rad, of the pull to the rest pose on joints of which nothing is seen; 0 is none
     rest_support: float = 5.0  # points on a limb that halve this pull
-    rest_penalty: float = 0.0004  # m of misfit per rad^2 of all joints: of two poses that fit, the usual one is taken
+    rest_penalty: float = 0.0004  # m of misfit per rad^2 off the rest pose: the more usual of two fits wins
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
     rim: RimConfig = field(default_factory=RimConfig)
@@ -220,8 +214,8 @@ class Registrar(nn.Module):
         )
         normal = (frames @ normal.flatten(1, 2)[..., None])[..., 0]
         scale = weight.flatten(1).sqrt() / config.noise_sd
-        # Along the normal the distance counts in full. Along the surface it does so only as far as asked, which lets
-        # a limb slide to where it fits, except for points behind the rim, whose way along the ray counts too.
+        # Along the normal the distance counts in full; along the surface only as far as asked, which lets a limb slide
+        # to where it fits. A point behind the rim differs from its foot along the surface too, and counts less there.
         eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
         outer = normal[..., :, None] * normal[..., None, :]
         spread = outer + config.tangential * (eye - outer)  # (B, rows, 3, 3), symmetric
