@@ -9,8 +9,6 @@ import json
 import multiprocessing
 import signal
 import sys
-import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -150,10 +148,15 @@ class ClipMaker:
 
     def find(self, planned: PlannedClip) -> ObservedClip | None:
         """The clip in the cache; None where it is not there or its file is damaged."""
+        path = self.path(planned)
+        if not path.exists():
+            return None
         try:
-            with self.path(planned).open("rb") as file, np.load(file) as archive:
+            with path.open("rb") as file, np.load(file) as archive:
                 pose, directions, silhouettes, error = (torch.from_numpy(archive[name]) for name in _ARRAYS)
-        except (FileNotFoundError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        except OSError:
+            raise
+        except Exception:  # zipfile, zlib and NumPy's own parser each complain of damage in their own words
             return None
         clip = Clip(planned.activity, str(planned.subject), str(planned.take), pose, directions, silhouettes)
         return ObservedClip(clip, error)
