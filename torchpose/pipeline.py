@@ -60,6 +60,8 @@ class EyesConfig:
     stereo: GrowingSeedsConfig = field(default_factory=GrowingSeedsConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     face: FaceConfig = field(default_factory=FaceConfig)
+    range_scale: int = 4  # by which images are shrunk to find the person's range of disparities
+    range_margin: float = 0.5  # m before its near end: a hand may be too thin for the small images
     min_points: int = 60  # fewer points on the person are nobody
 
     def __post_init__(self) -> None:
@@ -67,8 +69,8 @@ class EyesConfig:
             raise ValueError(
                 f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}"
             )
-        if self.background_frames < 1 or self.min_points < 1:
-            raise ValueError("background_frames and min_points must be at least 1")
+        if min(self.background_frames, self.min_points, self.range_scale) < 1:
+            raise ValueError("background_frames, min_points and range_scale must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class PoseConfig:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     height: float = 0.0  # m, of the person; 0 measures it
     size: SizeConfig = field(default_factory=SizeConfig)
-    size_frames: int = 6  # of the recording, from which height and proportions are measured
+    size_frames: int = 4  # of the recording, from which height and proportions are measured
     cells: CellConfig = field(default_factory=CellConfig)  # of the geodesic term
 
 
@@ -131,6 +133,31 @@ class Eyes(nn.Module):
         near, far = self.camera.disparity(torch.tensor([self.config.nearest, self.config.farthest])).tolist()
         return math.floor(far), math.ceil(near)
 
+    def person_range(
+        self,
+        left: Float[Tensor, "1 3 height width"],
+        right: Float[Tensor, "1 3 height width"],
+        region: Bool[Tensor, "1 height width"],
+    ) -> tuple[int, int]:
+        """Disparities to search in this frame, px: up to the person's nearest, from a look at a small copy of it.
+
+        The cost of matching is that of the disparities searched, and most of those that `nearest` allows lie
+        before the person. The far end stays: a shadow on the wall must find its match there, or it finds a wrong
+        one on the person.
+        """
+        low, high = self.disparity_range
+        shrink = self.config.range_scale
+        size = (left.shape[2] // shrink, left.shape[3] // shrink)
+        small = [torch.nn.functional.interpolate(image, size, mode="area") for image in (left, right)]
+        mask = torch.nn.functional.interpolate(region[:, None].to(left), size, mode="area")[:, 0] > 0
+        found = self.stereo(*small, mask, disparity_range=(low // shrink, -(-high // shrink))).values
+        values = shrink * found[found.isfinite()]
+        if len(values) < self.config.min_points:
+            return low, high
+        near = float(self.camera.depth(values.quantile(0.99))) - self.config.range_margin
+        many = float(self.camera.disparity(torch.tensor(max(near, self.config.nearest))))
+        return low, min(high, math.ceil(many))
+
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
         """Learn the empty scene from its frames, or where there are none from the recording itself."""
         spread = _spread(len(recording), self.config.background_frames)
@@ -174,7 +201,8 @@ class Eyes(nn.Module):
                 log_odds = self.background(images)
                 region = search_region(log_odds, self.config.silhouette)
             with self.stopwatch.measure("stereo"):
-                disparity = self.stereo(images, right, region, disparity_range=self.disparity_range)
+                span = self.person_range(images, right, region)
+                disparity = self.stereo(images, right, region, disparity_range=span)
                 depth = self.camera.depth(disparity.values)
         with self.stopwatch.measure("silhouette"):
             silhouette = person_silhouette(
