@@ -113,7 +113,11 @@ def test_full_precision_agrees_with_the_table(result: Path):
 
 
 def test_an_interrupted_run_goes_on_and_ends_the_same(
-    folder: Path, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    result: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ):
     monkeypatch.setattr(session, "PART", 2)
     step = tp.StereoToPose.step
@@ -151,7 +155,13 @@ def test_other_settings_start_over(folder: Path, tmp_path: Path, monkeypatch: py
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("registration/*.yaml")), ids=lambda path: path.stem)
 def test_every_registration_config_runs_for_a_step(path: Path, folder: Path, tmp_path: Path):
-    command = [f"recording={folder}", f"output={tmp_path}", f"registration={path.stem}", "max_frames=1", *QUICK]
+    command = [
+        f"recording={folder}",
+        f"output={tmp_path}",
+        f"registration={path.stem}",
+        "max_frames=1",
+        *QUICK,
+    ]
     assert infer_main(command) == 0
     assert len(rows(tmp_path)) == 1
 

@@ -32,8 +32,12 @@ def test_the_start_and_size_oracles_put_the_body_on_the_true_joints(recording: P
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("oracles", [(), ("disparity", "mask", "labels", "start", "size")], ids=["ours", "truth"])
-def test_a_real_recording_is_measured_within_the_first_issue_s_targets(recording: Path, oracles: tuple[str, ...]):
+@pytest.mark.parametrize(
+    "oracles", [(), ("disparity", "mask", "labels", "start", "size")], ids=["ours", "truth"]
+)
+def test_a_real_recording_is_measured_within_the_first_issue_s_targets(
+    recording: Path, oracles: tuple[str, ...]
+):
     figures = measure(recording, load_config("infer"), oracles, frames=10)
     assert figures["angle_deg"] < 12
     assert figures["joint_mm"] < 100
