@@ -9,7 +9,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -62,6 +62,7 @@ class EyesConfig:
     face: FaceConfig = field(default_factory=FaceConfig)
     range_scale: int = 4  # by which images are shrunk to find the person's range of disparities
     range_margin: float = 0.5  # m before its near end: a hand may be too thin for the small images
+    least_matched: float = 0.7  # share of the foreground; with less the range was wrong, and all is searched
     min_points: int = 60  # fewer points on the person are nobody
 
     def __post_init__(self) -> None:
@@ -122,6 +123,9 @@ class Eyes(nn.Module):
         self.camera = camera
         self.config = config
         self.stereo = GrowingSeeds(config.stereo)
+        # On a small copy the person is small, too, and holes do not matter.
+        island = max(1, config.stereo.min_island // config.range_scale**2)
+        self.glance = GrowingSeeds(replace(config.stereo, windows=(5,), min_island=island, fill=False))
         self.find_faces = FaceDetector(config.face)
         self.stopwatch = Stopwatch()
         self.background: BackgroundModel | DepthBackground | None = None
@@ -150,7 +154,7 @@ class Eyes(nn.Module):
         size = (left.shape[2] // shrink, left.shape[3] // shrink)
         small = [torch.nn.functional.interpolate(image, size, mode="area") for image in (left, right)]
         mask = torch.nn.functional.interpolate(region[:, None].to(left), size, mode="area")[:, 0] > 0
-        found = self.stereo(*small, mask, disparity_range=(low // shrink, -(-high // shrink))).values
+        found = self.glance(*small, mask, disparity_range=(low // shrink, -(-high // shrink))).values
         values = shrink * found[found.isfinite()]
         if len(values) < self.config.min_points:
             return low, high
@@ -203,6 +207,10 @@ class Eyes(nn.Module):
             with self.stopwatch.measure("stereo"):
                 span = self.person_range(images, right, region)
                 disparity = self.stereo(images, right, region, disparity_range=span)
+                changed = log_odds > 0
+                matched = float((disparity.values.isfinite() & changed).sum() / changed.sum().clamp_min(1))
+                if span != self.disparity_range and matched < self.config.least_matched:
+                    disparity = self.stereo(images, right, region, disparity_range=self.disparity_range)
                 depth = self.camera.depth(disparity.values)
         with self.stopwatch.measure("silhouette"):
             silhouette = person_silhouette(
