@@ -61,7 +61,7 @@ class EyesConfig:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     face: FaceConfig = field(default_factory=FaceConfig)
     range_scale: int = 4  # by which images are shrunk to find the person's range of disparities
-    range_margin: float = 0.5  # m before its near end: a hand may be too thin for the small images
+    range_margin: float = 0.8  # m before its near end: an arm may be too thin for the small images
     least_matched: float = 0.7  # share of the foreground; with less the range was wrong, and all is searched
     min_points: int = 60  # fewer points on the person are nobody
 
