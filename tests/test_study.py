@@ -2,6 +2,10 @@
 
 import functools
 import json
+import os
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +30,7 @@ from torchpose.synthesis.database import DatabaseConfig, PlannedClip, plan_datab
 from torchpose.version import __version__
 from torchpose.vision.background import SilhouetteConfig
 
+ROOT = Path(__file__).resolve().parents[1]
 BODY = BodyModel()
 DATABASE = DatabaseConfig(
     activities=("left_hand", "right_leg"),
@@ -271,6 +276,34 @@ def test_processes_make_what_one_process_makes(tmp_path: Path):
     for one, other in zip(alone.clips, together.clips, strict=True):
         assert torch.equal(one.stream("silhouettes"), other.stream("silhouettes"))
         torch.testing.assert_close(one.stream("pose"), other.stream("pose"), equal_nan=True)
+
+
+ONE_WORKER = """
+import multiprocessing, os, time
+from concurrent.futures import ProcessPoolExecutor
+from torchpose.clips import _be_one_of_many
+pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _be_one_of_many)
+print(pool.submit(os.getpid).result(), flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.slow  # two processes import torch
+def test_workers_end_with_whoever_started_them():
+    with subprocess.Popen(
+        [sys.executable, "-c", ONE_WORKER], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    ) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        os.kill(worker, 0)  # it is there
+        parent.kill()
+        for _ in range(100):
+            try:
+                os.kill(worker, 0)
+            except ProcessLookupError:
+                return
+            time.sleep(0.1)
+    pytest.fail(f"process {worker} goes on without its parent")
 
 
 def test_the_study_counts_right_and_wrong_answers(tmp_path: Path, stand_in: Maker):

@@ -7,8 +7,10 @@ import functools
 import hashlib
 import json
 import multiprocessing
+import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -210,7 +212,16 @@ def _stored(maker: ClipMaker, plan: Sequence[PlannedClip], workers: int) -> Iter
 
 
 def _be_one_of_many() -> None:
-    """A worker has one thread, and an interruption of the whole ends it at once and without a word."""
+    """A worker has one thread to compute with, and ends at once and without a word when the whole does."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Whoever is killed cannot tell its workers, and they would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
