@@ -194,7 +194,7 @@ class Eyes(nn.Module):
             )
         if frame.depth is not None:
             depth = frame.depth[None].to(device)
-            images = frame.left[None].to(device) if frame.left is not None else _grey(depth)
+            images = frame.left[None].to(device) if frame.left is not None else depth_picture(depth)
             with self.stopwatch.measure("background"):
                 log_odds = self.background(depth)
         else:
@@ -419,7 +419,7 @@ def _stack(values: list[Tensor | None]) -> Tensor:
     return torch.stack(there)
 
 
-def _grey(depth: Float[Tensor, "batch height width"]) -> Float[Tensor, "batch 3 height width"]:
+def depth_picture(depth: Float[Tensor, "batch height width"]) -> Float[Tensor, "batch 3 height width"]:
     """A picture of a depth image for people: near is bright."""
     near = (1 / depth.clamp_min(0.5)).nan_to_num(0.0).clamp(0, 2) / 2
     return near[:, None].expand(-1, 3, -1, -1)

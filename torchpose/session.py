@@ -32,7 +32,7 @@ from torchpose.export import (
     write_summary,
 )
 from torchpose.figures import Overlay, draw_overlay, plot_angles
-from torchpose.pipeline import FramePose, StereoToPose
+from torchpose.pipeline import FramePose, StereoToPose, depth_picture
 from torchpose.recording import Recording, UnreadableFrame
 
 PART = 50  # frames between two savings: what an interruption costs at the most
@@ -184,8 +184,7 @@ class Session:
         if frame.left is not None:
             return frame.left
         assert frame.depth is not None
-        near = (1 / frame.depth.clamp_min(0.5)).nan_to_num(0.0).clamp(0, 2) / 2
-        return near.expand(3, -1, -1)
+        return depth_picture(frame.depth[None])[0]
 
     def _summary(self, sequence: PoseSequence, seconds: float, frames: int) -> dict[str, Any]:
         counts = Counter(sequence.status)
