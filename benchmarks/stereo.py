@@ -32,7 +32,7 @@ import yaml
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.vision.stereo import GrowingSeeds, GrowingSeedsConfig
+from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
 
 PAPER = GrowingSeedsConfig(windows=(5,), min_island=0, fill=False, smoothing=0)
 SCENE_RANGE = (0, 63)  # px

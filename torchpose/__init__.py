@@ -18,7 +18,8 @@ from torchpose.vision.background import BackgroundModel, DepthBackground, person
 from torchpose.vision.camera import RawStereo, StereoCamera
 from torchpose.vision.faces import FaceDetector, Faces
 from torchpose.vision.points import PointCloud, group_cells, sample_grid
-from torchpose.vision.stereo import Disparity, GrowingSeeds
+from torchpose.vision.disparity import Disparity
+from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
 
 __all__ = [
     "ANATOMICAL_NAMES",

@@ -44,7 +44,8 @@ from torchpose.vision.background import (
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.faces import FaceConfig, FaceDetector, Faces
 from torchpose.vision.points import CellConfig, PointCloud, SamplingConfig, group_cells, sample_grid
-from torchpose.vision.stereo import GrowingSeeds, GrowingSeedsConfig
+from torchpose.vision.growing_seeds import GrowingSeeds
+from torchpose.vision.stereo import StereoConfig, stereo_matcher
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class EyesConfig:
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
-    stereo: GrowingSeedsConfig = field(default_factory=GrowingSeedsConfig)
+    stereo: StereoConfig = field(default_factory=StereoConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     face: FaceConfig = field(default_factory=FaceConfig)
     range_scale: int = 4  # by which images are shrunk to find the person's range of disparities
@@ -122,10 +123,10 @@ class Eyes(nn.Module):
         super().__init__()
         self.camera = camera
         self.config = config
-        self.stereo = GrowingSeeds(config.stereo)
+        self.stereo = stereo_matcher(config.stereo)
         # On a small copy the person is small, too, and holes do not matter.
-        island = max(1, config.stereo.min_island // config.range_scale**2)
-        self.glance = GrowingSeeds(replace(config.stereo, windows=(5,), min_island=island, fill=False))
+        island = max(1, config.stereo.gcs.min_island // config.range_scale**2)
+        self.glance = GrowingSeeds(replace(config.stereo.gcs, windows=(5,), min_island=island, fill=False))
         self.find_faces = FaceDetector(config.face)
         self.stopwatch = Stopwatch()
         self.background: BackgroundModel | DepthBackground | None = None

@@ -2,6 +2,7 @@
 
 import heapq
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -14,16 +15,17 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.testing import assert_close
 
+from torchpose.vision.disparity import Disparity
 from torchpose.vision.disparity_space import GROWTH, DisparitySpace, box_sum, similarities
-from torchpose.vision.stereo import (
+from torchpose.vision.growing_seeds import (
     GrowingSeeds,
     GrowingSeedsConfig,
     best_rival,
     component_sizes,
+    confident_matches,
     fill,
     given_seeds,
     grow,
-    match,
     smooth,
     without_islands,
 )
@@ -83,8 +85,8 @@ def step(height: int = 48, width: int = 96, near: int = 12, far: int = 4) -> tup
     return rgb(left), rgb(right), truth.where(~hidden & (u >= far), torch.nan)
 
 
-def matcher(**changes: object) -> GrowingSeeds:
-    return GrowingSeeds(GrowingSeedsConfig(**({"max_disparity": 20} | changes)))  # type: ignore[arg-type]
+def matcher(**changes: object) -> "partial[Disparity]":
+    return partial(GrowingSeeds(GrowingSeedsConfig(**changes)), disparity_range=(0, 20))  # type: ignore[arg-type]
 
 
 def density_and_error(values: Tensor, truth: Tensor, border: int = 0) -> tuple[float, Tensor]:
@@ -212,8 +214,8 @@ def test_the_last_frames_disparities_are_good_seeds() -> None:
 
 def test_the_range_of_a_call_replaces_the_configs() -> None:
     left, right, _ = plane(40, 80, 15.0)
-    assert matcher(**PAPER, max_disparity=10)(left, right).values.isfinite().double().mean() < 0.05
-    values = matcher(**PAPER, max_disparity=10)(left, right, disparity_range=(12, 18)).values
+    assert matcher(**PAPER)(left, right, disparity_range=(0, 10)).values.isfinite().double().mean() < 0.05
+    values = matcher(**PAPER)(left, right, disparity_range=(12, 18)).values
     assert values[0, 3:-3, 25:-3].isfinite().double().mean() > 0.98
     # Columns that the right image does not show are left out, and negative disparities are ordinary.
     swapped = matcher(**PAPER)(right, left, disparity_range=(-20, -10)).values
@@ -324,11 +326,11 @@ def test_the_wave_front_agrees_with_the_sequential_queue(tolerance: int) -> None
     seeds = torch.full((1, 30, 60), torch.nan, dtype=torch.float64)
     places = torch.rand(30, 60) < 0.03
     seeds[0][places] = truth[places]
-    network = matcher(**(PAPER | NO_CORNERS | {"tolerance": tolerance, "max_disparity": 12}))
-    ours = network(left, right, seeds=seeds).values[0].round().numpy()
+    network = matcher(**(PAPER | NO_CORNERS | {"tolerance": tolerance}))
+    ours = network(left, right, seeds=seeds, disparity_range=(0, 12)).values[0].round().numpy()
     points = [(y, x, int(seeds[0, y, x])) for y, x in (~seeds[0].isnan()).nonzero().tolist()]
     grey = [image[0, 0].numpy() for image in (left, right)]
-    queue = sequential_queue(*grey, points, 13, network.config)
+    queue = sequential_queue(*grey, points, 13, network.func.config)
     either = np.isfinite(ours) | np.isfinite(queue)
     assert either.sum() > 900
     # Sub-pixel peaks may round to the next disparity.
@@ -469,7 +471,7 @@ def test_a_match_beats_its_rivals_by_a_margin(shared: str, rival: float, wins: b
     other = (2, 7, 15) if shared == "left" else (2, 7, 19)
     volume = volume_of(space, {best: 0.8, other: rival})
     cells = torch.tensor([cell_at(space, *best), cell_at(space, *other)])
-    layers, similarity = match(volume, cells, space, GrowingSeedsConfig())
+    layers, similarity = confident_matches(volume, cells, space, GrowingSeedsConfig())
     assert layers.isfinite().sum() == int(wins)
     if wins:
         pixel = 2 * space.columns + 15
@@ -555,7 +557,6 @@ def test_smoothing_keeps_steps_and_holes() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"min_disparity": 5, "max_disparity": 4}, "range must not be empty, got 5 to 4 px"),
         ({"windows": (5, 4)}, r"windows must be odd sides of at least 3 px, got \(5, 4\)"),
         ({"windows": ()}, "windows must be odd sides"),
         ({"noise": 0.0}, "noise must be positive, got 0"),
@@ -595,8 +596,9 @@ def test_middlebury(shared_data: Path, name: str, least: float, most: float) -> 
     """The paper's method at quarter size; measured 0.81 at 5.1 % and 0.72 at 6.8 %."""
     folder = shared_data / "stereo_truth" / name
     truth = torch.from_numpy(np.load(folder / "disparity.npz")["disparity"])
-    network = GrowingSeeds(GrowingSeedsConfig(**PAPER, max_disparity=63))  # type: ignore[arg-type]
-    values = network(read(folder / "left.png"), read(folder / "right.png")).values[0]
+    network = GrowingSeeds(GrowingSeedsConfig(**PAPER))  # type: ignore[arg-type]
+    images = read(folder / "left.png"), read(folder / "right.png")
+    values = network(*images, disparity_range=(0, 63)).values[0]
     density, error = density_and_error(values, truth)
     assert density > least
     assert (error > 1).double().mean() < most
