@@ -272,7 +272,12 @@ def interrupt(config: object, device: object) -> None:
     [
         (["recordin=x"], print, 2, "error: unknown config key 'recordin'; did you mean 'recording'?\n"),
         (["device=gpu"], print, 2, "error: device must be one that this machine has, got 'gpu'; device=cpu"),
-        ([], fail_reading, 2, "error: the recording must be a folder, but /no such folder does not exist"),
+        (
+            [],
+            fail_reading,
+            2,
+            "error: the recording must be a folder or a video, but /no such folder does not exist",
+        ),
         ([], fail_on_disk, 2, "error: /proc/no: "),
         ([], interrupt, 130, "\ninterrupted: the same command again goes on where this one stopped\n"),
     ],

@@ -181,6 +181,36 @@ def test_a_depth_camera_s_recording_runs_too(synthetic: SyntheticRecording, tmp_
     assert (sequence.joints - synthetic.joints[:2].to(sequence.joints))[:, 3:].norm(dim=-1).mean() < 0.08
 
 
+@pytest.mark.filterwarnings("always")
+def test_a_side_by_side_video_s_poses_are_right_and_its_other_frame_rate_is_said(
+    synthetic: SyntheticRecording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The renderer's pairs as one lossless video at 12 Hz, by a calibration that says 10."""
+    camera, shots = synthetic.camera, list(synthetic)[:3]
+    write_recording(
+        tmp_path / "empty", camera, [tp.Frame(0, 0.0, *(image[0] for image in synthetic.background(1)))]
+    )
+    for side in ("left", "right"):
+        (tmp_path / "empty" / side / "000000.png").rename(tmp_path / "empty" / f"{side}_0.png")
+    path = tmp_path / "both.avi"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"FFV1"), 12, (640, 240))
+    for shot in shots:
+        pair = torch.cat([shot.left[0], shot.right[0]], dim=2)
+        writer.write(np.ascontiguousarray((pair * 255).round().byte().permute(1, 2, 0).numpy()[..., ::-1]))
+    writer.release()
+    command = [f"calibration={tmp_path / 'empty' / 'calibration.yaml'}", f"background={tmp_path / 'empty'}"]
+    assert infer_main([f"recording={path}", *command, f"output={tmp_path / 'out'}", *QUICK]) == 0
+    error = capsys.readouterr().err
+    assert error.startswith(
+        f"warning: {path} has 12 frames a second and the calibration says 10: times are by"
+    )
+    assert error.count("\n") == 1
+    sequence = tp.read_poses_csv(tmp_path / "out" / "poses.csv")
+    assert sequence.time_s.tolist() == [0, 0.1, 0.2]
+    assert all(sequence.answered)
+    assert (sequence.joints - synthetic.joints[:3].to(sequence.joints))[:, 3:].norm(dim=-1).mean() < 0.08
+
+
 def damage(folder: Path, kind: str) -> None:
     calibration = folder / "calibration.yaml"
     if kind == "unequal counts":
@@ -221,6 +251,8 @@ def test_a_bad_recording_is_one_sentence_and_nothing_is_written(
 def test_a_missing_folder_and_an_unknown_setting_are_one_sentence(capsys: pytest.CaptureFixture[str]):
     assert infer_main(["recording=/nowhere/at/all"]) == 2
     assert "/nowhere/at/all" in capsys.readouterr().err
+    assert infer_main(["right=right.mp4"]) == 2
+    assert "right must come with a recording, got none; give recording=PATH" in capsys.readouterr().err
     assert infer_main(["pose.registration.round=3"]) == 2
     assert "did you mean 'rounds'?" in capsys.readouterr().err
 

@@ -25,6 +25,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "background",
         "points",
         "faces",
+        "alignment",
+        "calibrate",
     ),
     "body": ("skeleton", "model", "ellipsoid", "superquadric", "angle"),
     "registration": ("likelihood", "labelling", "geodesic", "fitting", "silhouette", "vem", "size", "start"),
@@ -36,7 +38,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "synthesis": ("motion", "room", "render", "database"),
     "learning": ("part_network", "training"),
     "the desk": (
-        *("calibration", "recording", "rendered", "export", "figures"),
+        *("calibration", "image_file", "video", "recording", "rendered", "export", "figures"),
         *("pipeline", "session", "clips", "study", "cli"),
     ),
 }

@@ -377,11 +377,16 @@ def test_a_folder_that_is_no_recording(stereo: Path, spoil: Callable[[Path], obj
 
 
 def test_what_is_no_folder(tmp_path: Path):
-    with pytest.raises(ValueError, match=r"must be a folder, but .*nowhere does not exist; check the path"):
+    with pytest.raises(
+        ValueError, match=r"a folder or a video, but .*nowhere does not exist; check the path"
+    ):
         open_recording(tmp_path / "nowhere")
     (tmp_path / "video.mp4").touch()
-    with pytest.raises(ValueError, match=r"must be a folder with .*got the file .*video.mp4"):
+    with pytest.raises(ValueError, match=r"must come with its calibration, got none for .*video.mp4; give"):
         open_recording(tmp_path / "video.mp4")
+    calibrate(tmp_path, STEREO)
+    with pytest.raises(ValueError, match=r"video.mp4 must be a video that OpenCV can read"):
+        open_recording(tmp_path / "video.mp4", calibration=tmp_path / "calibration.yaml")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

@@ -5,6 +5,7 @@ import math
 import shutil
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -45,7 +46,11 @@ Kind = Literal["infer", "train"]
 class InferConfig:
     """Recover a person's joint angles from a recording by a stereo or depth camera."""
 
-    recording: str | None = None  # folder of the recording; null: one that the package makes itself
+    # folder of the recording, a side-by-side stereo video, or a left video; null: one that the package makes itself
+    recording: str | None = None
+    right: str | None = None  # the right video, where `recording` is the left one
+    calibration: str | None = None  # its file, instead of the folder's own; a video needs one
+    background: str | None = None  # folder with images of the empty scene, instead of the folder's own
     output: str = "runs/infer"  # folder for the results
     max_frames: int | None = None  # take only the first so many frames
     fresh: bool = False  # start over instead of continuing an interrupted run
@@ -56,6 +61,9 @@ class InferConfig:
     pose: PoseConfig = field(default_factory=PoseConfig)
 
     def __post_init__(self) -> None:
+        given = [name for name in ("right", "calibration", "background") if getattr(self, name) is not None]
+        if self.recording is None and given:
+            raise ValueError(f"{given[0]} must come with a recording, got none; give recording=PATH as well")
         if self.max_frames is not None and self.max_frames < 1:
             raise ValueError(f"max_frames must be at least 1, got {self.max_frames}; null takes all frames")
         _check_machine(self.seed, self.threads)
@@ -143,7 +151,7 @@ def infer(config: InferConfig, device: torch.device) -> None:
         print("no recording given: making one (recording=DIR runs yours)")
         recording: Recording = demo_recording(config.seed)
     else:
-        recording = open_recording(config.recording)
+        recording = open_recording(config.recording, config.right, config.calibration, config.background)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
     output = Path(config.output)
     session = Session(model, recording, output, settings_of(config), __version__)
@@ -206,7 +214,9 @@ def run_command(kind: Kind, argv: Sequence[str], action: Callable[[Any, torch.de
         config = load_config(kind, argv)
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
-        action(config, find_device(config.device))
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            action(config, find_device(config.device))
     except KeyboardInterrupt:
         print("\ninterrupted: the same command again goes on where this one stopped", file=sys.stderr)
         return INTERRUPTED
@@ -237,6 +247,11 @@ def _check_machine(seed: int, threads: int) -> None:
         raise ValueError(f"seed must be 0 or more, got {seed}; choose another")
     if threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}; 1 is the default")
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    """A warning as a person at the command line wants it: the sentence alone."""
+    print(f"warning: {message}", file=sys.stderr)
 
 
 def _raised_by_the_package(error: BaseException) -> bool:

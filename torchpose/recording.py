@@ -1,16 +1,15 @@
-"""Recordings: folders of stereo pairs or of depth frames, read lazily and checked before anything starts.
+"""Recordings: folders of stereo pairs or of depth frames, and videos, read lazily and checked before anything starts.
 
 Images are RGB, float32 in [0, 1], (3, H, W); depth is in metres, (H, W), NaN where there is no reading. All
 are on the CPU and rectified; depth belongs to the left camera, whose frame is x right, y down, z forward.
 """
 
-import re
-from collections.abc import Iterable, Iterator, Mapping
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 import torch
 import yaml
@@ -19,12 +18,22 @@ from torch import Tensor
 
 from torchpose.atomic import replacing
 from torchpose.calibration import Calibration, read_calibration
+from torchpose.image_file import (
+    DEPTH_UNIT,
+    decode,
+    numbered_files,
+    read_colour,
+    read_depth,
+    to_colour,
+    write_image,
+)
+from torchpose.video import VideoFile
 from torchpose.vision.camera import StereoCamera
 
 CALIBRATION = "calibration.yaml"
-_WRITTEN_DEPTH_UNIT = 0.001  # m
-_JPEG_QUALITY = 95
-_FRAME_NAME = r"(\d+)\.(?:jpg|jpeg|png)"
+BACKGROUND = "background"
+_RATE_TOLERANCE = 0.01  # relative; frame rates that differ by more are not the same
+_LATE_END = 1.0  # s, by which one of two videos may end later than the other
 
 
 @dataclass(frozen=True)
@@ -76,9 +85,10 @@ class Recording(Protocol):
 class FolderRecording:
     """A recording in a folder, see `open_recording`; nothing but the frame asked for is in memory."""
 
-    def __init__(self, folder: Path, calibration: Calibration) -> None:
+    def __init__(self, folder: Path, calibration: Calibration, background: Path | None = None) -> None:
         self.folder = folder
         self.calibration = calibration
+        self._background = background or folder / BACKGROUND
         if calibration.depth_unit is None:
             streams = ["left", "right"]
         else:
@@ -112,51 +122,18 @@ class FolderRecording:
         if "depth" in images:
             colour = images.get("colour")
             return Frame(index, time_s, None if colour is None else colour[0], depth=images["depth"][0])
-        left, right = self._rectify(images["left"], images["right"])
+        left, right = _rectify(self.calibration, images["left"], images["right"])
         return Frame(index, time_s, left[0], right[0])
 
     def background(self) -> Backgrounds:
-        """The frames of the empty scene in `background/`; none where there is no such folder.
+        """The frames of the empty scene; none where there is no folder of them.
 
         Raises ValueError where one cannot be read, or where the left and the right ones do not pair up.
         """
-        folder = self.folder / "background"
-        if self.calibration.depth_unit is not None:
-            files = _numbered_files(folder, "depth_")
-            return Backgrounds(depth=self._stack("depth", files)) if files else Backgrounds()
-        left, right = _numbered_files(folder, "left_"), _numbered_files(folder, "right_")
-        if left.keys() != right.keys():
-            raise ValueError(
-                f"every left_K in {folder} must have its right_K, got left {sorted(left)} and right "
-                f"{sorted(right)}; add the missing images or remove the single ones"
-            )
-        if not left:
-            return Backgrounds()
-        return Backgrounds(*self._rectify(self._stack("left", left), self._stack("right", right)))
+        return _backgrounds(self._background, self.calibration)
 
     def _read(self, stream: str, path: Path) -> Float[Tensor, "*channels height width"]:
-        unit = self.calibration.depth_unit
-        image = _read_depth(path, unit) if unit and stream == "depth" else _read_colour(path)
-        self._require_size(path, image.shape[-1], image.shape[-2])
-        return image
-
-    def _stack(self, stream: str, files: Mapping[int, Path]) -> Float[Tensor, "num *channels height width"]:
-        return torch.stack([self._read(stream, files[index]) for index in sorted(files)])
-
-    def _rectify(
-        self, left: Float[Tensor, "num 3 height width"], right: Float[Tensor, "num 3 height width"]
-    ) -> tuple[Float[Tensor, "num 3 height width"], Float[Tensor, "num 3 height width"]]:
-        if self.calibration.raw is None:
-            return left, right
-        left, right, _ = self.calibration.raw.rectify(left, right)
-        return left, right
-
-    def _require_size(self, path: Path, width: int, height: int) -> None:
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise ValueError(
-                f"{path} must have the calibration's size {self.camera.width} x {self.camera.height}, got "
-                f"{width} x {height}; calibrate this camera at this resolution or correct image_size"
-            )
+        return _read_image(path, self.calibration, stream == "depth")
 
     def _check_size(self, stream: str) -> None:
         """Raise ValueError unless the stream's first image that can be read has the calibration's size."""
@@ -164,35 +141,177 @@ class FolderRecording:
         for index in self.indices:
             path = self._files[stream][index]
             try:
-                height, width = _decode(path).shape[:2]
+                height, width = decode(path).shape[:2]
             except ValueError as error:
                 damage.append(str(error))
             else:
-                return self._require_size(path, width, height)
+                return _require_size(path, self.camera, width, height)
         raise ValueError(f"{self.folder / stream} must have an image that can be read, got none: {damage[0]}")
 
 
-def open_recording(path: str | Path) -> FolderRecording:
-    """The recording in a folder.
+class VideoRecording:
+    """A recording in one side-by-side stereo video or in two videos, see `open_recording`.
 
-    It has `calibration.yaml` (see `read_calibration`); `left/NNNNNN.{jpg,png}` and `right/NNNNNN.{jpg,png}`,
-    or `depth/NNNNNN.png` (uint16, 0 where there is no reading) and, if there is any,
-    `colour/NNNNNN.{jpg,png}` on the depth camera's pixels; and, if there are any, frames of the empty scene,
-    `background/left_K.*` and `background/right_K.*`, or `background/depth_K.png`. NNNNNN is the frame's
-    number, and the frame's time is this number over the frame rate.
-
-    Raises ValueError where the folder, its calibration or its files are not so. Images after the first are
-    looked at when they are read.
+    Nothing but the frame asked for is in memory. Reading in order decodes each frame once.
     """
-    folder = Path(path)
-    if not folder.exists():
-        raise ValueError(f"the recording must be a folder, but {folder} does not exist; check the path")
-    if not folder.is_dir():
+
+    def __init__(
+        self, videos: Sequence[VideoFile], calibration: Calibration, background: Path | None = None
+    ) -> None:
+        self.calibration = calibration
+        self._videos = tuple(videos)
+        self._background = background
+        self._length = min(map(len, videos))
+        if calibration.depth_unit is not None:
+            raise ValueError(
+                f"a video must be of a stereo pair, got the calibration of a depth camera for {videos[0].path}; "
+                "write a depth camera's frames into a folder depth/ of 16 bit PNG"
+            )
+        self._check_sizes()
+        self._check_rates()
+
+    @property
+    def camera(self) -> StereoCamera:
+        return self.calibration.camera
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[position] for position in range(len(self)))
+
+    def __getitem__(self, position: int, /) -> Frame:
+        """The frame at `position`, 0 to len - 1 (or from the end, -1 to -len).
+
+        Raises UnreadableFrame where the video is damaged.
+        """
+        index = range(self._length)[position]
+        time_s = index / self.camera.frame_rate
+        try:
+            pixels = [video.read(index) for video in self._videos]
+        except ValueError as error:
+            raise UnreadableFrame(f"frame {index} cannot be read: {error}", index, time_s) from None
+        eyes = pixels if len(pixels) == 2 else np.split(pixels[0], 2, axis=1)
+        left, right = (to_colour(eye)[None] for eye in eyes)
+        left, right = _rectify(self.calibration, left, right)
+        return Frame(index, time_s, left[0], right[0])
+
+    def background(self) -> Backgrounds:
+        """The frames of the empty scene; none where there is no folder of them."""
+        return _backgrounds(self._background, self.calibration) if self._background else Backgrounds()
+
+    def _check_sizes(self) -> None:
+        camera, single = self.camera, len(self._videos) == 1
+        width = camera.width * (2 if single else 1)
+        for video in self._videos:
+            if (video.width, video.height) != (width, camera.height):
+                meaning = "twice the calibration's width" if single else "the calibration's size"
+                hint = "for two videos give right=FILE as well" if single else "correct image_size"
+                raise ValueError(
+                    f"{video.path} must have {meaning}, {width} x {camera.height}, got {video.width} x "
+                    f"{video.height}; calibrate this camera at this resolution, or {hint}"
+                )
+
+    def _check_rates(self) -> None:
+        """Raise ValueError for two videos that cannot be paired; warn where they, or the calibration, differ."""
+        rates = [video.frame_rate for video in self._videos]
+        lengths = [len(video) for video in self._videos]
+        names = " and ".join(str(video.path) for video in self._videos)
+        if not _same_rate(rates[0], rates[-1]):
+            raise ValueError(
+                f"the two videos must have one frame rate, got {rates[0]:.4g} and {rates[1]:.4g} Hz in {names}; "
+                "record both at the same rate"
+            )
+        if max(lengths) - min(lengths) > _LATE_END * rates[0]:
+            raise ValueError(
+                f"the two videos must have the same frames, got {lengths[0]} and {lengths[1]} in {names}; "
+                "cut both to the same moments"
+            )
+        if lengths[0] != lengths[-1]:
+            warnings.warn(
+                f"of {lengths[0]} and {lengths[1]} frames in {names} the last {max(lengths) - min(lengths)} have no "
+                "partner and are left out",
+                stacklevel=3,
+            )
+        if not _same_rate(rates[0], self.camera.frame_rate):
+            warnings.warn(
+                f"{self._videos[0].path} has {rates[0]:.4g} frames a second and the calibration says "
+                f"{self.camera.frame_rate:.4g}: times are by the calibration",
+                stacklevel=3,
+            )
+
+
+def open_recording(
+    path: str | Path,
+    right: str | Path | None = None,
+    calibration: str | Path | None = None,
+    background: str | Path | None = None,
+) -> FolderRecording | VideoRecording:
+    """The recording in a folder, in a side-by-side stereo video, or in two videos.
+
+    A folder has `calibration.yaml` (see `read_calibration`); `left/NNNNNN.{jpg,png}` and
+    `right/NNNNNN.{jpg,png}`, or videos `left.*` and `right.*`, or `depth/NNNNNN.png` (uint16, 0 where there
+    is no reading) and, if there is any, `colour/NNNNNN.{jpg,png}` on the depth camera's pixels; and, if there
+    are any, frames of the empty scene, `background/left_K.*` and `background/right_K.*`, or
+    `background/depth_K.png`. NNNNNN is the frame's number, in a video its place, and the frame's time is this
+    number over the calibration's frame rate.
+
+    Args:
+        path: the folder, or a video: the left one, or one whose left half is the left camera's image.
+        right: the right video, where `path` is the left one.
+        calibration: file of the calibration, instead of the folder's own; a video must have one.
+        background: folder with the frames of the empty scene, instead of the folder's own.
+
+    Raises ValueError where these are not so. Images and frames after the first are looked at when they are
+    read. Warns where the calibration's frame rate is not the video's.
+    """
+    path = Path(path)
+    if not path.exists():
         raise ValueError(
-            f"the recording must be a folder with {CALIBRATION}, left/ and right/, got the file {folder}; "
-            "give the folder, and write a video's frames into one first"
+            f"the recording must be a folder or a video, but {path} does not exist; check the path"
         )
-    return FolderRecording(folder, read_calibration(folder / CALIBRATION))
+    scene = None if background is None else Path(background)
+    if scene is not None and not scene.is_dir():
+        raise ValueError(
+            f"the background must be a folder with left_K and right_K images, got {scene}; check it"
+        )
+    if not path.is_dir():
+        if calibration is None:
+            raise ValueError(
+                f"a video must come with its calibration, got none for {path}; give calibration=FILE"
+            )
+        videos = [VideoFile(file) for file in (path, right) if file is not None]
+        return _video_recording(videos, Path(calibration), scene)
+    if right is not None:
+        raise ValueError(
+            f"right must be a video beside a left one, got {right} beside the folder {path}; leave it out"
+        )
+    file = path / CALIBRATION if calibration is None else Path(calibration)
+    videos = [VideoFile(video) for side in ("left", "right") for video in _video_in(path, side)]
+    if not videos:
+        return FolderRecording(path, read_calibration(file), scene)
+    if len(videos) != 2:
+        raise ValueError(
+            f"there must be a left.* and a right.* video, got only {videos[0].path}; add the other one"
+        )
+    return _video_recording(videos, file, scene or path / BACKGROUND)
+
+
+def _video_recording(
+    videos: Sequence[VideoFile], calibration: Path, background: Path | None
+) -> VideoRecording:
+    return VideoRecording(videos, read_calibration(calibration), background)
+
+
+def _video_in(folder: Path, side: str) -> list[Path]:
+    """The video of one eye, in a list; empty where there is none, as there are images."""
+    files = [path for path in sorted(folder.glob(f"{side}.*")) if path.is_file()]
+    if files and (len(files) > 1 or (folder / side).is_dir()):
+        names = " and ".join(path.name for path in [*files, folder / side][:2])
+        raise ValueError(
+            f"the {side} camera must have one video or one folder, got {names} in {folder}; remove one"
+        )
+    return files
 
 
 def write_recording(
@@ -222,19 +341,19 @@ def write_recording(
                     "a camera with a baseline takes stereo pairs, one without takes depth"
                 )
         for field, stream in names.items():
-            _write_image(folder / stream / f"{frame.index:06d}", getattr(frame, field), suffix)
+            write_image(folder / stream / f"{frame.index:06d}", getattr(frame, field), suffix)
         count += 1
     if not count:
         raise ValueError("a recording must have at least one frame, got none; give some frames")
     for field in required if backgrounds else ():
         stack = getattr(backgrounds, field)
         for k, image in enumerate(stack if stack is not None else ()):
-            _write_image(folder / "background" / f"{field}_{k}", image, suffix)
+            write_image(folder / "background" / f"{field}_{k}", image, suffix)
     calibration = {
         "image_size": [camera.width, camera.height],
         "focal_length": camera.focal_length,
         "principal_point": [camera.cx, camera.cy],
-        **({"baseline": camera.baseline} if stereo else {"depth_unit": _WRITTEN_DEPTH_UNIT}),
+        **({"baseline": camera.baseline} if stereo else {"depth_unit": DEPTH_UNIT}),
         "frame_rate": camera.frame_rate,
         "rectified": True,
     }
@@ -243,26 +362,9 @@ def write_recording(
     return folder
 
 
-def _numbered_files(folder: Path, prefix: str = "") -> dict[int, Path]:
-    """The images named `prefix` and a number in a folder, by number; {} where there is no such folder."""
-    files: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        match = re.fullmatch(prefix + _FRAME_NAME, path.name, re.IGNORECASE)
-        if match is None:
-            continue
-        number = int(match[1])
-        if number in files:
-            raise ValueError(
-                f"every number must stand for one image, got {files[number].name} and {path.name} in "
-                f"{folder}; remove one of them"
-            )
-        files[number] = path
-    return files
-
-
 def _paired_files(folder: Path, streams: list[str]) -> dict[str, dict[int, Path]]:
     """The images of each stream by frame number: the same numbers in each, and at least one."""
-    found = {stream: _numbered_files(folder / stream) for stream in streams}
+    found = {stream: numbered_files(folder / stream) for stream in streams}
     for stream, files in found.items():
         if not (folder / stream).is_dir():
             raise ValueError(
@@ -287,50 +389,54 @@ def _paired_files(folder: Path, streams: list[str]) -> dict[str, dict[int, Path]
     return found
 
 
-def _decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
-    """The pixels of an image file, as OpenCV orders them; ValueError where the file is damaged or cut off."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path} must be readable, got {error.strerror}; replace the file") from None
-    # The decoders fill up what is missing at the end of a file with grey, so look for the end itself.
-    end, start = (b"IEND", 0) if data.startswith(b"\x89PNG") else (b"\xff\xd9", data.rfind(b"\xff\xda") + 1)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if end in data[start:] else None
-    if image is None:
-        raise ValueError(f"{path} must be a whole JPEG or PNG image, got {len(data)} bytes that are not")
+def _rectify(
+    calibration: Calibration,
+    left: Float[Tensor, "num 3 height width"],
+    right: Float[Tensor, "num 3 height width"],
+) -> tuple[Float[Tensor, "num 3 height width"], Float[Tensor, "num 3 height width"]]:
+    if calibration.raw is None:
+        return left, right
+    left, right, _ = calibration.raw.rectify(left, right)
+    return left, right
+
+
+def _backgrounds(folder: Path, calibration: Calibration) -> Backgrounds:
+    """The frames of the empty scene in a folder; ValueError where one cannot be read or has no partner."""
+
+    def stack(files: Mapping[int, Path], depth: bool = False) -> Float[Tensor, "num *channels height width"]:
+        return torch.stack([_read_image(files[index], calibration, depth) for index in sorted(files)])
+
+    if calibration.depth_unit is not None:
+        files = numbered_files(folder, "depth_")
+        return Backgrounds(depth=stack(files, depth=True)) if files else Backgrounds()
+    left, right = numbered_files(folder, "left_"), numbered_files(folder, "right_")
+    if left.keys() != right.keys():
+        raise ValueError(
+            f"every left_K in {folder} must have its right_K, got left {sorted(left)} and right "
+            f"{sorted(right)}; add the missing images or remove the single ones"
+        )
+    if not left:
+        return Backgrounds()
+    return Backgrounds(*_rectify(calibration, stack(left), stack(right)))
+
+
+def _read_image(
+    path: Path, calibration: Calibration, depth: bool = False
+) -> Float[Tensor, "*channels height width"]:
+    """A colour image, or where `depth` depth in m; ValueError unless it has the calibration's size."""
+    unit = calibration.depth_unit
+    image = read_depth(path, unit) if unit and depth else read_colour(path)
+    _require_size(path, calibration.camera, image.shape[-1], image.shape[-2])
     return image
 
 
-def _read_colour(path: Path) -> Float[Tensor, "3 height width"]:
-    # The calibration is of the sensor's rows and columns, whatever the file says of its orientation.
-    pixels = _decode(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    return torch.from_numpy(pixels).permute(2, 0, 1).float().div(255)
-
-
-def _read_depth(path: Path, unit: float) -> Float[Tensor, "height width"]:
-    steps = _decode(path)
-    if steps.dtype != np.uint16 or steps.ndim != 2:
+def _require_size(path: Path, camera: StereoCamera, width: int, height: int) -> None:
+    if (width, height) != (camera.width, camera.height):
         raise ValueError(
-            f"{path} must be a depth image of one channel of uint16, got {steps.dtype} of shape "
-            f"{steps.shape}; write it as a 16 bit grey PNG"
+            f"{path} must have the calibration's size {camera.width} x {camera.height}, got "
+            f"{width} x {height}; calibrate this camera at this resolution or correct image_size"
         )
-    depth = torch.from_numpy(steps.astype(np.float32)) * unit
-    return depth.masked_fill(depth == 0, torch.nan)
 
 
-def _write_image(path: Path, image: Tensor | None, suffix: str) -> None:
-    """Write colour (3, H, W) as `suffix` or depth (H, W) as PNG; nothing where there is no image."""
-    if image is None:
-        return
-    image = image.detach().cpu()
-    if image.ndim == 2:
-        steps = (image / _WRITTEN_DEPTH_UNIT).round()
-        # 0 is no reading; so is what does not fit into 16 bits.
-        steps = steps.where((steps > 0) & (steps < 2**16), 0)
-        suffix, pixels = ".png", steps.numpy().astype(np.uint16)
-    else:
-        levels = (image.clamp(0, 1) * 255).round().byte()
-        pixels = np.ascontiguousarray(levels.permute(1, 2, 0).numpy()[..., ::-1])
-    _, data = cv2.imencode(suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    with replacing(path.with_suffix(suffix)) as partial:
-        partial.write_bytes(data.tobytes())
+def _same_rate(one: float, other: float) -> bool:
+    return abs(one - other) <= _RATE_TOLERANCE * other
