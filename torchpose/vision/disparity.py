@@ -5,6 +5,7 @@ Disparity d = x_left - x_right in px at the pixels of the left image; NaN where 
 
 from dataclasses import dataclass
 
+import cv2
 import torch
 from jaxtyping import Bool, Float
 from kornia.color import rgb_to_grayscale
@@ -67,6 +68,38 @@ class StereoMatcher(nn.Module):
     ) -> Disparity:
         """Disparities `least` to `greatest` of grey pairs at the mask's pixels, of which there is one at least."""
         raise NotImplementedError
+
+
+def without_islands(disparity: Grey, area: int) -> Grey:
+    """NaN where fewer than `area` pixels hang together, by steps to a side of at most 1 px. By OpenCV, on the CPU."""
+    if area <= 1:
+        return disparity
+    none, fraction = -32768, 16  # OpenCV's fixed point
+    steps = (disparity * fraction).round().nan_to_num(none).to(torch.int16).cpu().numpy()
+    for image in steps:
+        cv2.filterSpeckles(image, none, area - 1, fraction)
+    return disparity.where(torch.from_numpy(steps != none).to(disparity.device), torch.nan)
+
+
+def smooth(disparity: Grey, radius: int) -> Grey:
+    """Mean of the neighbours in a square whose disparity is within 1 px of the pixel's own; NaN stays NaN."""
+    if radius == 0:
+        return disparity
+    total, count = torch.zeros_like(disparity), torch.ones_like(disparity)
+    height, width = disparity.shape[1:]
+    # Who is near whom goes both ways, so half of the square will do.
+    for row in range(radius + 1):
+        for column in range(-radius if row else 1, radius + 1):
+            one = (slice(None), slice(row, None), slice(max(0, column), width + min(0, column)))
+            other = (slice(None), slice(None, height - row), slice(max(0, -column), width - max(0, column)))
+            difference = disparity[one] - disparity[other]
+            near = (difference.abs() <= 1).to(difference)  # 0 for NaN
+            count[one] += near
+            count[other] += near
+            difference.nan_to_num_().mul_(near)
+            total[one] -= difference
+            total[other] += difference
+    return disparity + total / count
 
 
 def _check_sizes(left: Tensor, right: Tensor, mask: Tensor | None, seeds: Tensor | None) -> None:

@@ -11,7 +11,7 @@ from kornia.feature import harris_response
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchpose.vision.disparity import Disparity, Grey, StereoMatcher
+from torchpose.vision.disparity import Disparity, Grey, StereoMatcher, smooth, without_islands
 from torchpose.vision.disparity_space import DisparitySpace, crop_beyond, similarities
 
 HARRIS_REACH = 6  # px that a Harris maximum sees: gradient, blur and the comparison with its neighbours
@@ -30,6 +30,7 @@ class GrowingSeedsConfig:
     noise: float = 0.3 / 255  # standard deviation of a grey value; rounding to 8 bits makes 0.29 / 255
     seed_similarity: float = 0.9  # least similarity of a seed
     weakest_corners: float = 0.1  # share of the Harris points that is dropped
+    seed_shift: int = 2  # px by which a given disparity may have changed
     tau: float = 0.6  # least similarity of a cell
     mu: float = 0.1  # a cell this much worse than the best at its pixels still grows
     max_waves: int = 500  # a wave grows by a pixel or two
@@ -39,7 +40,7 @@ class GrowingSeedsConfig:
     matching_rounds: int = 5
     min_island: int = 100  # px, least area of matches that hang together
     fill: bool = True  # extend the matches into the mask's holes
-    fill_levels: tuple[float, ...] = (0.95, 0.85, 0.75, 0.65, 0.55)  # least similarity, falling: best first
+    fill_levels: tuple[float, ...] = (0.95, 0.75, 0.55)  # least similarity, falling: best first
     fill_smoothness: float = 0.3  # similarity that a px away from the neighbours' mean must gain
     smoothing: int = 2  # px, radius of the last mean over neighbours within 1 px of disparity
 
@@ -61,7 +62,7 @@ class GrowingSeedsConfig:
             )
         if not 0 <= self.weakest_corners < 1:
             raise ValueError(f"weakest_corners must be in [0, 1), got {self.weakest_corners}; it is a share")
-        for name in ("mu", "beta", "tolerance", "min_island", "fill_smoothness", "smoothing"):
+        for name in ("mu", "beta", "tolerance", "seed_shift", "min_island", "fill_smoothness", "smoothing"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 turns it off")
         for name in ("max_waves", "max_candidates", "matching_rounds"):
@@ -73,7 +74,7 @@ class GrowingSeeds(StereoMatcher):
     """Stereo matching that says what it knows, at a cost that goes with the region asked for.
 
     1. Similarity: modified normalised cross-correlation of the grey images.
-    2. Seeds: Harris points with a good match on their row, and the caller's, such as the last frame's
+    2. Seeds: Harris points with a good match on their row, or the caller's, such as the last frame's
        disparities.
     3. Growth, in waves: each new cell offers the best neighbour of each of four sets; one that is similar
        enough, and not much worse than the best at its two pixels, is a new cell. So depth goes on from where
@@ -109,15 +110,16 @@ class GrowingSeeds(StereoMatcher):
         middle = left.mean(dim=(1, 2), keepdim=True)
         left, right = left - middle, right - middle
         volume = similarities(left, right, mask, space, tuple(config.windows), config.noise)
-        cells = corner_seeds(volume, left, mask, space, config)
-        if seeds is not None:
-            cells = torch.cat([cells, given_seeds(space.crop(seeds), mask, space)])
+        if seeds is None:
+            cells = corner_seeds(volume, left, mask, space, config)
+        else:
+            cells = given_seeds(volume, space.crop(seeds), mask, space, config)
         layers, similarity = confident_matches(volume, grow(volume, cells, space, config), space, config)
-        if config.min_island > 1:
-            layers = without_islands(layers, space, config.min_island)
+        found = without_islands(space.unpad(layers), config.min_island)
         if config.fill:
-            layers, similarity = fill(volume, layers, similarity, mask, space, config)
-        found = smooth(space.unpad(layers), config.smoothing)
+            layers, similarity = fill(volume, space.pad(found, torch.nan), similarity, mask, space, config)
+            found = space.unpad(layers)
+        found = smooth(found, config.smoothing)
         space.crop(values).copy_(found + (space.least - 1))
         space.crop(confidence).copy_(space.unpad(similarity).clamp(0, 1).where(~found.isnan(), 0))
         return Disparity(values, confidence)
@@ -148,20 +150,49 @@ def corner_seeds(
     rank = torch.arange(len(point), device=point.device) - (count.cumsum(0) - count)[item]
     point = point[rank >= (config.weakest_corners * count).floor()[item]]
 
-    bottom = space.cell(space.pixel(point), torch.ones_like(point))
+    return similar_cells(volume, space.pixel(point), space, config)
+
+
+def given_seeds(
+    volume: Float[Tensor, " cells"],
+    seeds: Float[Tensor, "batch h w"],
+    mask: Bool[Tensor, "batch h w"],
+    space: DisparitySpace,
+    config: GrowingSeedsConfig,
+) -> Int[Tensor, " seeds"]:
+    """Cells near known disparities (px), and cells of other pixels that are similar enough to be seeds.
+
+    What was known moves: the most similar layer within `seed_shift` counts. For whatever no seed speaks, such as an
+    arm that was elsewhere, every fourth pixel takes the part of a Harris point.
+    """
+    layer = (seeds - (space.least - 1)).round()
+    known = mask & (layer >= 1) & (layer <= space.disparities)
+    pixel = space.pixel(known.flatten().nonzero()[:, 0])
+    reach = torch.arange(-config.seed_shift, config.seed_shift + 1, device=pixel.device)[:, None]
+    near = space.cell(pixel, (layer[known].long() + reach).clamp(1, space.disparities))  # (shifts, seeds)
+    best, shift = volume.index_select(0, near.flatten()).view(near.shape).max(dim=0, keepdim=True)
+    good = (best[0] >= config.tau).nonzero()[:, 0]
+    pixel, cells = pixel.index_select(0, good), near.gather(0, shift)[0].index_select(0, good)
+
+    open_ = space.pad(mask, False).index_fill(0, pixel, False)
+    lattice = torch.zeros_like(space.unpad(open_))
+    lattice[:, ::2, ::2] = True
+    others = space.pixel((space.unpad(open_) & lattice).flatten().nonzero()[:, 0])
+    return torch.cat([cells, similar_cells(volume, others, space, config)])
+
+
+def similar_cells(
+    volume: Float[Tensor, " cells"],
+    pixel: Int[Tensor, " pixels"],
+    space: DisparitySpace,
+    config: GrowingSeedsConfig,
+) -> Int[Tensor, " seeds"]:
+    """The most similar cell of each pixel, where that is similar enough for a seed."""
+    bottom = space.cell(pixel, torch.ones_like(pixel))
     along = bottom[:, None] + torch.arange(space.disparities, device=bottom.device) * space.columns
     best, layer = volume[along].max(dim=1)
     good = best >= config.seed_similarity
     return bottom[good] + layer[good] * space.columns
-
-
-def given_seeds(
-    seeds: Float[Tensor, "batch h w"], mask: Bool[Tensor, "batch h w"], space: DisparitySpace
-) -> Int[Tensor, " seeds"]:
-    """Cells of known disparities (px), as far as they lie in the mask and in the range."""
-    layer = (seeds - (space.least - 1)).round()
-    inside = mask & (layer >= 1) & (layer <= space.disparities)
-    return space.cell(space.pixel(inside.flatten().nonzero()[:, 0]), layer[inside].long())
 
 
 def grow(
@@ -183,23 +214,29 @@ def grow(
     similarity = volume[seeds]
     grown = [seeds[:0]]
     proposed = 0
-    for _ in range(config.max_waves):
-        new = ((similarity >= config.tau) & (number[front[0]] < 0)).nonzero()[:, 0]
+    for wave in range(config.max_waves):
+        new = ((similarity >= config.tau) & (number.index_select(0, front[0]) < 0)).nonzero()[:, 0]
         if len(new) == 0:
             break
-        front, similarity = front[:, new], similarity[new]
+        front, similarity = front.index_select(1, new), similarity.index_select(0, new)
         cell, left, right = front
         own = torch.arange(proposed, proposed + len(new), dtype=torch.int32, device=volume.device)
         proposed += len(new)
-        number[cell] = own
+        number.scatter_(0, cell, own)
         best_left.scatter_reduce_(0, left, similarity, "amax")
         best_right.scatter_reduce_(0, right, similarity, "amax")
-        bar = torch.minimum(best_left[left], best_right[right]) - config.mu
-        accepted = (number[cell] == own) & (similarity >= bar) & (carried[left] < config.max_candidates)
-        front = front[:, accepted.nonzero()[:, 0]]
+        bar = torch.minimum(best_left.index_select(0, left), best_right.index_select(0, right)) - config.mu
+        sole = number.index_select(0, cell) == own
+        room = carried.index_select(0, left) < config.max_candidates
+        front = front.index_select(1, (sole & room & (similarity >= bar)).nonzero()[:, 0])
         cell, left, _ = front
         carried.index_add_(0, left, torch.ones_like(left, dtype=torch.int32))
         grown.append(cell)
+        if wave == 0:  # a seed among seeds has nothing to propose, and a last frame's are mostly so
+            beside = torch.tensor([[-1], [1], [-space.columns], [space.columns]], device=cell.device)
+            alone = carried.index_select(0, (left + beside).flatten()).view(4, -1) == 0
+            front = front.index_select(1, alone.any(0).nonzero()[:, 0])
+            cell = front[0]
         around = volume.index_select(0, (cell + steps[0].reshape(-1, 1)).flatten())
         around = around.view(steps.shape[1], steps.shape[2], len(cell))
         similarity, member = around.max(dim=1)  # (sets, cells)
@@ -217,7 +254,7 @@ def confident_matches(
     """Strictly confident matching: maps of the sub-pixel layer, NaN where none, and of the similarity."""
     layers = volume.new_full((space.left_pixels,), torch.nan)
     similarity = torch.zeros_like(layers)
-    left, layer, value = space.left_pixel(grown), space.layer(grown), volume[grown]
+    left, layer, value = space.left_pixel(grown), space.layer(grown), volume.index_select(0, grown)
     right = space.right_pixel(left, layer)
     for _ in range(config.matching_rounds):
         rival = torch.maximum(
@@ -228,16 +265,20 @@ def confident_matches(
         if len(won) == 0:
             break
         # Close cells of one left pixel can win together: the best of them counts.
-        best = torch.zeros_like(similarity).scatter_reduce_(0, left[won], value[won], "amax")
-        won = won[value[won] == best[left[won]]]
-        similarity[left[won]] = value[won]
-        layers[left[won]] = _sub_pixel(volume, space.cell(left[won], layer[won]), layer[won], space)
+        place, most = left.index_select(0, won), value.index_select(0, won)
+        best = torch.zeros_like(similarity).scatter_reduce_(0, place, most, "amax")
+        sole = (most == best.index_select(0, place)).nonzero()[:, 0]
+        won, place, most = won.index_select(0, sole), place.index_select(0, sole), most.index_select(0, sole)
+        similarity.scatter_(0, place, most)
+        level = layer.index_select(0, won)
+        layers.scatter_(0, place, _sub_pixel(volume, space.cell(place, level), level, space))
         # Whatever shares a winner's left pixel goes, and what competes with it at its right pixel.
         winner = torch.full((space.right_pixels,), -1, device=layer.device)
-        winner[right[won]] = layer[won]
-        free = (winner[right] < 0) | ((winner[right] - layer).abs() <= config.tolerance)
-        rest = (layers[left].isnan() & free).nonzero()[:, 0]
-        left, right, layer, value = left[rest], right[rest], layer[rest], value[rest]
+        winner.scatter_(0, right.index_select(0, won), level)
+        holder = winner.index_select(0, right)
+        free = (holder < 0) | ((holder - layer).abs() <= config.tolerance)
+        rest = (layers.index_select(0, left).isnan() & free).nonzero()[:, 0]
+        left, right, layer, value = (x.index_select(0, rest) for x in (left, right, layer, value))
     return layers, similarity
 
 
@@ -254,50 +295,26 @@ def best_rival(
     all cells near the best.
     """
     first = value.new_full((pixels,), -1).scatter_reduce_(0, pixel, value, "amax")
-    leads = value == first[pixel]
+    highest = first.index_select(0, pixel)
+    leads = (value == highest).nonzero()[:, 0]
     leader = torch.zeros_like(first, dtype=layer.dtype)
-    leader[pixel[leads]] = layer[leads]
-    far = (layer - leader[pixel]).abs() > tolerance
-    second = torch.full_like(first, -1).scatter_reduce_(0, pixel[far], value[far], "amax")
-    return torch.where(far, first[pixel], second[pixel])
+    leader.scatter_(0, pixel.index_select(0, leads), layer.index_select(0, leads))
+    far = (layer - leader.index_select(0, pixel)).abs() > tolerance
+    away = far.nonzero()[:, 0]
+    second = torch.full_like(first, -1)
+    second.scatter_reduce_(0, pixel.index_select(0, away), value.index_select(0, away), "amax")
+    return torch.where(far, highest, second.index_select(0, pixel))
 
 
 def _sub_pixel(
     volume: Float[Tensor, " cells"], cell: Int[Tensor, " n"], layer: Int[Tensor, " n"], space: DisparitySpace
 ) -> Float[Tensor, " n"]:
     """The layer where the parabola through three similarities peaks, at most half a layer away."""
-    below, here, above = volume[cell - space.columns], volume[cell], volume[cell + space.columns]
+    below, here, above = (volume.index_select(0, cell + step) for step in (-space.columns, 0, space.columns))
     curvature = 2 * here - below - above
     shift = 0.5 * (above - below) / curvature.clamp(min=torch.finfo(volume.dtype).tiny)
     measured = (layer > 1) & (layer < space.disparities) & (curvature > 0)  # the padding is no measurement
     return layer + shift.clamp(-0.5, 0.5).where(measured, 0)
-
-
-def without_islands(
-    layers: Float[Tensor, " pixels"], space: DisparitySpace, min_size: int
-) -> Float[Tensor, " pixels"]:
-    """NaN where fewer than `min_size` pixels hang together, by steps to a side of at most one layer."""
-    pixel = (~layers.isnan()).nonzero()[:, 0]
-    place = torch.zeros_like(layers, dtype=torch.long)
-    place[pixel] = torch.arange(len(pixel), device=pixel.device)
-    edges = []
-    for step in (1, space.columns):  # to the right, down; the padding is NaN
-        joined = ((layers[pixel] - layers[pixel + step]).abs() <= 1).nonzero()[:, 0]
-        edges.append(torch.stack([joined, place[pixel[joined] + step]]))
-    size = component_sizes(len(pixel), torch.cat(edges, dim=1))
-    return layers.index_fill(0, pixel[size < min_size], torch.nan)
-
-
-def component_sizes(nodes: int, edges: Int[Tensor, "2 edges"]) -> Int[Tensor, " nodes"]:
-    """Size of the connected component of each node: union-find, all edges at once."""
-    root = torch.arange(nodes, device=edges.device)
-    while edges.shape[1]:
-        low, high = root[edges].aminmax(dim=0)
-        root = root.scatter_reduce(0, high, low, "amin")  # hook each root below a smaller neighbour
-        while not torch.equal(flatter := root[root], root):
-            root = flatter
-        edges = edges[:, (root[edges[0]] != root[edges[1]]).nonzero()[:, 0]]
-    return root.bincount(minlength=nodes)[root]
 
 
 def fill(
@@ -319,47 +336,41 @@ def fill(
     across = space.columns
     sides = [-1, 1, -across, across, -across - 1, -across + 1, across - 1, across + 1]
     side = torch.tensor(sides, device=layers.device)[:, None]
+    about = torch.arange(-1, 2, device=layers.device)[:, None]
     taken = torch.full((space.right_pixels,), -1, device=layers.device)
     matched = (~layers.isnan()).nonzero()[:, 0]
-    owner = layers[matched].round().long()
-    taken[space.right_pixel(matched, owner)] = owner
+    owner = layers.index_select(0, matched).round().long()
+    taken.scatter_(0, space.right_pixel(matched, owner), owner)
     hole = space.pad(mask, False) & layers.isnan()
+    number = torch.zeros_like(hole, dtype=torch.int32)
     for least in config.fill_levels:
         rim = hole.nonzero()[:, 0]
         while len(rim):
-            beside = layers[rim + side]  # (8, rim)
+            beside = layers.index_select(0, (rim + side).flatten()).view(len(sides), -1)
             support = len(sides) - beside.isnan().sum(0)
             held = (support >= 2).nonzero()[:, 0]
-            rim, mean = rim[held], beside[:, held].nansum(0) / support[held]
-            near = mean.round() + torch.arange(-1, 2, device=mean.device)[:, None]
-            near = near.clamp(1, space.disparities)  # (3, rim)
-            value = volume[space.cell(rim.expand(3, -1), near.long())]
+            mean = (beside.nansum(0) / support).index_select(0, held)
+            rim = rim.index_select(0, held)
+            near = (mean.round().long() + about).clamp(1, space.disparities)  # (3, rim)
+            value = volume.index_select(0, space.cell(rim.expand(3, -1), near).flatten()).view(3, -1)
             choice = (value - config.fill_smoothness * (near - mean).abs()).argmax(0, keepdim=True)
-            value, layer = value.gather(0, choice)[0], near.gather(0, choice)[0].long()
-            other = taken[space.right_pixel(rim, layer)]
+            value, layer = value.gather(0, choice)[0], near.gather(0, choice)[0]
+            other = taken.index_select(0, space.right_pixel(rim, layer))
             free = (other < 0) | ((other - layer).abs() <= config.tolerance)
             accepted = (free & (value >= least)).nonzero()[:, 0]
-            pixel, layer, value, mean = rim[accepted], layer[accepted], value[accepted], mean[accepted]
+            pixel, layer, value, mean = (x.index_select(0, accepted) for x in (rim, layer, value, mean))
             cell = space.cell(pixel, layer)
-            peak = (value >= volume[cell - across]) & (value >= volume[cell + across])
+            peak = value >= torch.maximum(
+                volume.index_select(0, cell - across), volume.index_select(0, cell + across)
+            )
             settled = torch.maximum(torch.minimum(mean, layer + 0.5), layer - 0.5)
-            layers[pixel] = torch.where(peak, _sub_pixel(volume, cell, layer, space), settled)
-            similarity[pixel] = 0.5 * value
-            hole[pixel] = False
-            rim = (pixel + side).unique()
-            rim = rim[hole[rim]]
+            layers.scatter_(0, pixel, torch.where(peak, _sub_pixel(volume, cell, layer, space), settled))
+            similarity.scatter_(0, pixel, 0.5 * value)
+            hole.index_fill_(0, pixel, False)
+            rim = (pixel + side).flatten()
+            rim = rim.index_select(0, hole.index_select(0, rim).nonzero()[:, 0])
+            # Each once: of its copies, the one whose number is left in the map.
+            order = torch.arange(len(rim), dtype=torch.int32, device=rim.device)
+            number.scatter_(0, rim, order)
+            rim = rim.index_select(0, (number.index_select(0, rim) == order).nonzero()[:, 0])
     return layers, similarity
-
-
-def smooth(layers: Float[Tensor, "batch h w"], radius: int) -> Float[Tensor, "batch h w"]:
-    """Mean of the neighbours in a square whose disparity is within 1 px of the pixel's own; NaN stays NaN."""
-    height, width = layers.shape[1:]
-    padded = F.pad(layers, (radius,) * 4, value=torch.nan)
-    total, count = torch.zeros_like(layers), torch.zeros_like(layers)
-    for row in range(2 * radius + 1):
-        for column in range(2 * radius + 1):
-            difference = padded[:, row : row + height, column : column + width] - layers
-            near = difference.abs() <= 1  # False for NaN
-            total += difference.where(near, 0)
-            count += near
-    return layers + total / count.clamp(min=1)

@@ -72,7 +72,10 @@ class OpenCVMatcher(StereoMatcher):
         rows, columns = mask.any(2).any(0).nonzero()[:, 0], mask.any(1).any(0).nonzero()[:, 0]
         above, below = int(rows[0]), int(rows[-1]) + 1
         # OpenCV answers nothing in the first columns, for which the right image may not reach.
-        start, end = max(0, int(columns[0]) - least - count), min(left.shape[2], int(columns[-1]) + 1 - min(least, 0))
+        start, end = (
+            max(0, int(columns[0]) - least - count),
+            min(left.shape[2], int(columns[-1]) + 1 - min(least, 0)),
+        )
         for index, pair in enumerate(zip(left, right, strict=True)):
             images = [_eight_bit(image[above:below, start:end]) for image in pair]
             found = torch.from_numpy(matcher.compute(*images).astype(np.float32) / 16).to(left)
