@@ -38,7 +38,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "synthesis": ("motion", "room", "render", "database"),
     "learning": ("part_network", "training"),
     "the desk": (
-        *("calibration", "image_file", "video", "recording", "rendered", "export", "figures"),
+        *("depthai", "calibration", "image_file", "video", "recording", "rendered", "export", "figures"),
         *("pipeline", "session", "clips", "study", "cli"),
     ),
 }

@@ -1,9 +1,10 @@
-"""Calibrations: what `calibration.yaml` says of a recording's cameras, every value checked.
+"""Calibrations: what `calibration.yaml`, or a DepthAI `calib.json`, says of a recording's cameras, all of it checked.
 
 Pixels, metres, hertz. A wrong file is a ValueError of one sentence: what must hold, what came, what to do.
 """
 
 import difflib
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from torchpose.depthai import depthai_stereo
 from torchpose.vision.camera import RawStereo, StereoCamera
 
 RAW_KEYS = ("K1", "D1", "K2", "D2", "R", "T")
@@ -39,19 +41,28 @@ class Calibration:
     depth_unit: float | None = None  # m per step of the depth images; None: a stereo pair
 
 
-def read_calibration(path: str | Path) -> Calibration:
-    """The calibration in a YAML file, also in one that OpenCV wrote.
+def read_calibration(
+    path: str | Path, image_size: tuple[int, int] | None = None, frame_rate: float | None = None
+) -> Calibration:
+    """The calibration in a YAML file, also in one that OpenCV wrote, or in a DepthAI JSON file.
 
     Always `image_size` [width, height] px and `frame_rate` Hz. Rectified stereo: `focal_length` px,
     `principal_point` [cx, cy] px, `baseline` m, `rectified: true`. A depth camera: the same with `depth_unit`
     (m per step of its images) instead of `baseline`. Raw stereo: OpenCV's `K1, D1, K2, D2, R, T` (m) instead.
-    Other keys are left alone.
+    Other keys are left alone. DepthAI: see `depthai_stereo`.
+
+    Args:
+        path: the file.
+        image_size: width and height of an eye's images, px, to which a DepthAI calibration is scaled.
+        frame_rate: Hz, of the recording; for a DepthAI calibration, which has none.
 
     Raises ValueError where the file is absent or no YAML, and where a value is missing or makes no sense.
     """
     path = Path(path)
     try:
         values = _load(path)
+        if "cameraData" in values:
+            return _depthai(values, image_size, frame_rate)
         return _raw(values) if any(key in values for key in RAW_KEYS) else _rectified(values)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -108,6 +119,16 @@ def _raw(values: dict[str, Any]) -> Calibration:
         frame_rate=_positive(values, "frame_rate", "Hz"),
     )
     _check_length("T", float((raw.T**2).sum() ** 0.5))
+    return Calibration(raw.camera, raw)
+
+
+def _depthai(
+    values: dict[str, Any], image_size: tuple[int, int] | None, frame_rate: float | None
+) -> Calibration:
+    if frame_rate is None or "frame_rate" in values:
+        frame_rate = _positive(values, "frame_rate", "Hz", "DepthAI knows none: add a line to the file")
+    raw = depthai_stereo(values, frame_rate, image_size)
+    _check_length("the translation", float((raw.T**2).sum() ** 0.5))
     return Calibration(raw.camera, raw)
 
 
@@ -202,11 +223,13 @@ def _load(path: Path) -> dict[str, Any]:
         )
     try:
         text = path.read_text(encoding="utf-8")
-        # OpenCV's first line, `%YAML:1.0`, is no YAML.
-        values = yaml.load(text.partition("\n")[2] if text.startswith("%YAML:") else text, _Loader)
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"the calibration must be YAML, but {reason}; correct the file") from None
+        if path.suffix == ".json":
+            values = json.loads(text)
+        else:  # OpenCV's first line, `%YAML:1.0`, is no YAML.
+            values = yaml.load(text.partition("\n")[2] if text.startswith("%YAML:") else text, _Loader)
+    except (UnicodeDecodeError, json.JSONDecodeError, yaml.YAMLError) as error:
+        kind, reason = "JSON" if path.suffix == ".json" else "YAML", " ".join(str(error).split())
+        raise ValueError(f"the calibration must be {kind}, but {reason}; correct the file") from None
     if not isinstance(values, dict):
         raise ValueError(
             f"the calibration must be lines of `key: value`, got {type(values).__name__}; correct the file"

@@ -300,7 +300,8 @@ def open_recording(
 def _video_recording(
     videos: Sequence[VideoFile], calibration: Path, background: Path | None
 ) -> VideoRecording:
-    return VideoRecording(videos, read_calibration(calibration), background)
+    size = (videos[0].width // (3 - len(videos)), videos[0].height)  # of one eye
+    return VideoRecording(videos, read_calibration(calibration, size, videos[0].frame_rate), background)
 
 
 def _video_in(folder: Path, side: str) -> list[Path]:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 _SEEK_COST = 16  # frames that OpenCV decodes before the one it seeks
+_RATE_ROUNDING = 1e-3  # relative; time stamps are whole units of the container's clock
 _LATE_FAILURES = 64  # failed grabs that a decoder with delayed frames may give beyond one a frame
 
 
@@ -53,10 +54,12 @@ class VideoFile:
 
     @property
     def frame_rate(self) -> float:
-        """Frames in a second as the time stamps have it, or the header where these are missing; Hz."""
+        """Frames in a second, Hz: the header's if the time stamps bear it out, else the time stamps'."""
+        promised = float(self._capture.get(cv2.CAP_PROP_FPS))
         if len(self) < 2 or not self._stamped:
-            return float(self._capture.get(cv2.CAP_PROP_FPS))
-        return 1e6 * (len(self) - 1) / (self._stamps[-1] - self._stamps[0])
+            return promised
+        measured = 1e6 * (len(self) - 1) / (self._stamps[-1] - self._stamps[0])
+        return promised if abs(promised - measured) <= _RATE_ROUNDING * measured else measured
 
     def read(self, number: int) -> UInt8[np.ndarray, "height width 3"]:
         """The image of frame `number`, 0 to len - 1; ValueError where the decoder has none for it."""
