@@ -215,7 +215,7 @@ def run_command(kind: Kind, argv: Sequence[str], action: Callable[[Any, torch.de
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
             action(config, find_device(config.device))
     except KeyboardInterrupt:
         print("\ninterrupted: the same command again goes on where this one stopped", file=sys.stderr)
@@ -247,11 +247,6 @@ def _check_machine(seed: int, threads: int) -> None:
         raise ValueError(f"seed must be 0 or more, got {seed}; choose another")
     if threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}; 1 is the default")
-
-
-def _show_warning(message: Warning | str, *_: object) -> None:
-    """A warning as a person at the command line wants it: the sentence alone."""
-    print(f"warning: {message}", file=sys.stderr)
 
 
 def _raised_by_the_package(error: BaseException) -> bool:
