@@ -38,6 +38,7 @@ from torchpose.vision.background import (
     DepthBackground,
     DepthBackgroundConfig,
     SilhouetteConfig,
+    far_readings,
     person_silhouette,
     search_region,
 )
@@ -372,16 +373,6 @@ class StereoToPose(nn.Module):
             pose=spread(pose),
             pose_covariance=spread(covariance),
         )
-
-
-def far_readings(depth: Float[Tensor, "num height width"]) -> Float[Tensor, "num height width"]:
-    """The readings of each pixel that are the empty scene's, NaN elsewhere, m: those near the farthest.
-
-    Whoever walks through stands before the scene. The farthest reading itself is noise's choice, so the tenth from
-    the far end stands for it, and what lies within the noise of a depth camera around it belongs to it.
-    """
-    far = torch.nanquantile(depth, 0.9, dim=0)
-    return torch.where(depth > far - (0.05 + 0.01 * far**2), depth, torch.nan)
 
 
 def _upright_extent(sight: Sight) -> float:

@@ -207,6 +207,16 @@ class DepthBackground(nn.Module):
         return torch.where(depth.isnan(), 0, log_odds)
 
 
+def far_readings(depth: Float[Tensor, "num height width"]) -> Float[Tensor, "num height width"]:
+    """The readings of each pixel that are the empty scene's, NaN elsewhere, m: those near the farthest.
+
+    Whoever walks through stands before the scene. The farthest reading itself is noise's choice, so the tenth from
+    the far end stands for it, and what lies within the noise of a depth camera around it belongs to it.
+    """
+    far = torch.nanquantile(depth, 0.9, dim=0)
+    return torch.where(depth > far - (0.05 + 0.01 * far**2), depth, torch.nan)
+
+
 @dataclass(frozen=True)
 class Silhouette:
     """The person's pixels."""
