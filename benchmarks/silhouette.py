@@ -29,11 +29,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.people import Truth
-from benchmarks.stereo import sgbm
 from torchpose.atomic import replacing
 from torchpose.cli import InferConfig, load_config
 from torchpose.pipeline import Eyes
 from torchpose.recording import Backgrounds, Frame, Recording, open_recording
+from torchpose.vision.stereo import OpenCVMatcher
 
 Image = Float[Tensor, "3 height width"]
 Mask = Bool[Tensor, "height width"]
@@ -124,7 +124,7 @@ def measure(folder: Path, config: InferConfig, options: argparse.Namespace) -> d
     truth, eyes, device = Truth(folder), Eyes(recording.camera, config.eyes), torch.device("cpu")
     eyes.learn_background(recording.background(), recording, device)
     eyes.stopwatch.seconds.clear()
-    rivals = Subtraction(recording)
+    rivals, sgbm = Subtraction(recording), OpenCVMatcher()
     ious: dict[str, list[float]] = {}
     errors: dict[str, list[Tensor]] = {}
     for position in range(len(recording)):
@@ -140,7 +140,7 @@ def measure(folder: Path, config: InferConfig, options: argparse.Namespace) -> d
         assert frame.left is not None
         assert frame.right is not None
         ours = recording.camera.disparity(sight.depth[0])
-        theirs = sgbm(frame.left[None], frame.right[None], None, eyes.disparity_range)
+        theirs = sgbm(frame.left[None], frame.right[None], disparity_range=eyes.disparity_range).values[0]
         known = person & true.isfinite()
         for name, found in (("disparity", ours), ("sgbm", theirs)):
             errors.setdefault(name, []).append((found - true).abs()[known])

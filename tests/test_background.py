@@ -7,14 +7,12 @@ import torch
 from kornia.morphology import dilation, erosion
 from torch.testing import assert_close
 
+from torchpose.vision.silhouette import SilhouetteConfig, person_silhouette, search_region
 from torchpose.vision.background import (
     BackgroundConfig,
     BackgroundModel,
     DepthBackground,
     DepthBackgroundConfig,
-    SilhouetteConfig,
-    person_silhouette,
-    search_region,
 )
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.photometry import noise_line, relative_gain, temporal_median

@@ -23,6 +23,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "semi_global",
         "stereo",
         "background",
+        "scene_match",
+        "silhouette",
         "points",
         "faces",
         "alignment",

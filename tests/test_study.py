@@ -28,7 +28,7 @@ from torchpose.rendered import RenderedRecording
 from torchpose.study import THESIS_ACCURACY, FeatureScore, count_material, run_study, study_table
 from torchpose.synthesis.database import DatabaseConfig, PlannedClip, plan_database
 from torchpose.version import __version__
-from torchpose.vision.background import SilhouetteConfig
+from torchpose.vision.silhouette import SilhouetteConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 BODY = BodyModel()

@@ -14,12 +14,13 @@ from torchpose.registration.vem import Observation, Registrar, RegistrationConfi
 from torchpose.rendered import demo_recording
 from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
 from torchpose.version import __version__
-from torchpose.vision.background import BackgroundModel, DepthBackground, person_silhouette
+from torchpose.vision.background import BackgroundModel, DepthBackground
 from torchpose.vision.camera import RawStereo, StereoCamera
-from torchpose.vision.faces import FaceDetector, Faces
-from torchpose.vision.points import PointCloud, group_cells, sample_grid
 from torchpose.vision.disparity import Disparity
+from torchpose.vision.faces import FaceDetector, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
+from torchpose.vision.points import PointCloud, group_cells, sample_grid
+from torchpose.vision.silhouette import person_silhouette
 
 __all__ = [
     "ANATOMICAL_NAMES",

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float
+from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, angle_sd, limb_angles
@@ -37,15 +38,14 @@ from torchpose.vision.background import (
     BackgroundModel,
     DepthBackground,
     DepthBackgroundConfig,
-    SilhouetteConfig,
     far_readings,
-    person_silhouette,
-    search_region,
 )
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.faces import FaceConfig, FaceDetector, Faces
-from torchpose.vision.points import CellConfig, PointCloud, SamplingConfig, group_cells, sample_grid
 from torchpose.vision.growing_seeds import GrowingSeeds
+from torchpose.vision.points import CellConfig, PointCloud, SamplingConfig, group_cells, sample_grid
+from torchpose.vision.scene_match import SceneMatch, SceneMatchConfig
+from torchpose.vision.silhouette import SilhouetteConfig, person_silhouette, search_region
 from torchpose.vision.stereo import StereoConfig, stereo_matcher
 
 
@@ -58,7 +58,9 @@ class EyesConfig:
     background_frames: int = 15  # of the recording, from which the empty scene is learned if none is given
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
+    scene_match: SceneMatchConfig = field(default_factory=SceneMatchConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    memory: float = 0.5  # s, for which the last frame's silhouette tells which part of this one is the person
     stereo: StereoConfig = field(default_factory=StereoConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     face: FaceConfig = field(default_factory=FaceConfig)
@@ -132,6 +134,9 @@ class Eyes(nn.Module):
         self.stopwatch = Stopwatch()
         self.background: BackgroundModel | DepthBackground | None = None
         self.background_depth: Tensor | None = None
+        self.scene_match: SceneMatch | None = None
+        self.last_time = -math.inf  # s, of the frame that `last_mask` belongs to
+        self.last_mask: Tensor | None = None
 
     @property
     def disparity_range(self) -> tuple[int, int]:
@@ -187,6 +192,8 @@ class Eyes(nn.Module):
         with self.stopwatch.measure("background"):
             disparity = self.stereo(left[:1], right[:1], disparity_range=(0, self.disparity_range[1]))
             self.background_depth = self.camera.depth(disparity.values)[0]
+            empty = rgb_to_grayscale(torch.stack([left.median(0).values, right.median(0).values]))[:, 0]
+            self.scene_match = SceneMatch(empty[0], empty[1], disparity.values[0], self.config.scene_match)
 
     def forward(self, frame: Frame, device: torch.device) -> Sight:
         """Look at one frame."""
@@ -204,7 +211,11 @@ class Eyes(nn.Module):
             assert frame.right is not None
             images, right = frame.left[None].to(device), frame.right[None].to(device)
             with self.stopwatch.measure("background"):
+                assert self.scene_match is not None
                 log_odds = self.background(images)
+                region = search_region(log_odds, self.config.silhouette)
+                grey = rgb_to_grayscale(torch.cat([images, right]))[:, 0]
+                log_odds = log_odds + self.scene_match(grey[:1], grey[1:], region)
                 region = search_region(log_odds, self.config.silhouette)
             with self.stopwatch.measure("stereo"):
                 span = self.person_range(images, right, region)
@@ -215,9 +226,17 @@ class Eyes(nn.Module):
                     disparity = self.stereo(images, right, region, disparity_range=self.disparity_range)
                 depth = self.camera.depth(disparity.values)
         with self.stopwatch.measure("silhouette"):
+            recent = 0 < frame.time_s - self.last_time < self.config.memory
             silhouette = person_silhouette(
-                log_odds, depth, self.config.silhouette, self.background_depth, self.camera
+                log_odds,
+                depth,
+                self.config.silhouette,
+                self.background_depth,
+                self.camera,
+                guide=rgb_to_grayscale(images)[:, 0],
+                previous=self.last_mask if recent else None,
             ).mask
+            self.last_time, self.last_mask = frame.time_s, silhouette
         with self.stopwatch.measure("points"):
             cloud = sample_grid(depth, silhouette, self.camera, self.config.sampling)
         with self.stopwatch.measure("faces"):

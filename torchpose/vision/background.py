@@ -1,4 +1,4 @@
-"""Which pixels are the person: a background model of colour or depth, and the silhouette refined by depth.
+"""What the empty scene looks like: a model of its colour or of its depth, and how far a frame is from it.
 
 Images are RGB in [0, 1], depth is metres along the left camera's z axis, NaN where there is no reading.
 Log-odds are log P(foreground) / P(background) per pixel, saturated so that no one cue settles a pixel.
@@ -7,15 +7,10 @@ Log-odds are log P(foreground) / P(background) per pixel, saturated so that no o
 import math
 from dataclasses import dataclass
 
-import cv2
-import kornia.morphology
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from torchpose.vision.camera import StereoCamera
 from torchpose.vision.photometry import gradient_squared, noise_line, relative_gain, temporal_median
 from torchpose.vision.windows import window_max, window_mean, window_min
 
@@ -215,187 +210,6 @@ def far_readings(depth: Float[Tensor, "num height width"]) -> Float[Tensor, "num
     """
     far = torch.nanquantile(depth, 0.9, dim=0)
     return torch.where(depth > far - (0.05 + 0.01 * far**2), depth, torch.nan)
-
-
-@dataclass(frozen=True)
-class Silhouette:
-    """The person's pixels."""
-
-    mask: Bool[Tensor, "batch height width"]
-
-
-@dataclass(frozen=True)
-class SilhouetteConfig:
-    """Settings of `person_silhouette` and `search_region`."""
-
-    search_threshold: float = -3.0  # log-odds above which a pixel is searched: unchanged ones are not
-    search_margin: int = 4  # px added around
-    depth_range: float = 1.0  # m, the person's depth to either side of the middle
-    depth_noise: float = 0.006  # m per m^2 of depth, where no stereo camera is given
-    disparity_noise: float = 0.25  # px, of a stereo camera
-    noise_floor: float = 0.02  # m
-    depth_weight: float = 3.0  # greatest log-odds that depth gives for or against a pixel
-    agreement: int = 2  # px, depth counts where it says the same all around: edges are fattened
-    bridge: int = 2  # px, parts apart by up to twice this belong together
-    max_hole: float = 0.002  # share of the person; larger holes stay if the background is seen through them
-    min_area: float = 0.008  # share of the image below which there is no person
-
-    def __post_init__(self) -> None:
-        for name in ("depth_range", "depth_noise", "disparity_noise", "noise_floor"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("search_margin", "agreement", "bridge", "depth_weight", "max_hole"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        if not 0 < self.min_area < 1:
-            raise ValueError(f"min_area must be a share of the image in (0, 1), got {self.min_area}")
-
-
-def search_region(
-    log_odds: Planes, config: SilhouetteConfig = SilhouetteConfig()
-) -> Bool[Tensor, "batch height width"]:
-    """Where to match the stereo pair: all that has changed, shadows too, for a grey shirt looks like one."""
-    changed = window_min((log_odds > config.search_threshold).to(log_odds.dtype), 1)  # a lone pixel is noise
-    return window_max(changed, 1 + config.search_margin) > 0
-
-
-def person_silhouette(
-    log_odds: Planes,
-    depth: Float[Tensor, "batch depth_height depth_width"],
-    config: SilhouetteConfig = SilhouetteConfig(),
-    background_depth: Float[Tensor, "background_height background_width"] | None = None,
-    camera: StereoCamera | None = None,
-) -> Silhouette:
-    """The person's silhouette: foreground of the background model, refined by depth (T. Fig. 3.6).
-
-    Depth adds to the log-odds: for the person in front of the background, against where it is the
-    background's own (a floor shadow lies on the floor), and what is far from the person's depth goes. Then
-    specks go, narrow gaps close, the largest connected part stays and its holes are filled, except those
-    through which the background is seen. A frame without enough foreground gets an empty mask.
-
-    Args:
-        log_odds: (B, H, W) of `BackgroundModel` or `DepthBackground`.
-        depth: (B, H, W) m, NaN where there is none; all NaN leaves colour alone to decide.
-        background_depth: (H, W) m of the empty scene, NaN where unknown.
-        camera: a stereo camera makes depth's noise `disparity_noise` Z^2 / (f b).
-    """
-    count, height, width = log_odds.shape
-    if depth.shape != log_odds.shape:
-        raise ValueError(
-            f"depth must have log_odds' shape {(count, height, width)}, got {tuple(depth.shape)}"
-        )
-    if background_depth is None:
-        background_depth = depth.new_full((height, width), torch.nan)
-    if background_depth.shape != (height, width):
-        raise ValueError(
-            f"background_depth must be one image of {(height, width)}, got {tuple(background_depth.shape)}; "
-            "take the median if there are several"
-        )
-    growth = config.depth_noise
-    if camera is not None and camera.baseline is not None:
-        growth = config.disparity_noise / (camera.focal_length * camera.baseline)
-    sigma = config.noise_floor + growth * background_depth.square()
-    # Depth cannot outvote log-odds below -depth_weight, so all else happens in the box of the pixels above.
-    rows, columns = _box(log_odds > -config.depth_weight, 2 * config.agreement + 2 * config.bridge + 2)
-    middle = _person_depth(log_odds, depth, background_depth - 3 * sigma)
-    log_odds, depth = log_odds[:, rows, columns], depth[:, rows, columns]
-    background_depth, sigma = background_depth[rows, columns], sigma[rows, columns]
-    log_odds = log_odds + _depth_evidence(depth, background_depth, sigma, middle, config)
-    mask = (log_odds > 0).to(log_odds.dtype)[:, None]
-    mask = kornia.morphology.opening(mask, log_odds.new_tensor([[0, 1, 0], [1, 1, 1], [0, 1, 0]]))
-    closed = window_min(window_max(mask[:, 0], 1), 1)  # narrow gaps, unless depth or colour deny them
-    mask = torch.maximum(mask[:, 0], closed * (log_odds > -2))
-    bridged = window_max(mask, config.bridge)
-    smallest = max(1, math.ceil(config.min_area * height * width))
-    whole = torch.zeros(count, height, width, dtype=torch.bool, device=mask.device)
-    for index in range(count):
-        whole[index, rows, columns] = _largest_part(
-            mask[index] > 0, bridged[index] > 0, log_odds[index], smallest, config.max_hole
-        )
-    return Silhouette(whole)
-
-
-def _depth_evidence(
-    depth: Planes,
-    background_depth: Plane,
-    sigma: Plane,
-    middle: Float[Tensor, " batch"],
-    config: SilhouetteConfig,
-) -> Planes:
-    """Log-odds that depth adds, 0 where it is unknown or where it says different things near by."""
-    outliers, span = 0.02, 5.0  # share of the readings, and metres over which they lie
-    in_front = ~(depth > background_depth + sigma)  # True where the background is unknown
-    near = ~((depth - middle[:, None, None]).abs() > config.depth_range)  # True where either is unknown
-    usual = (1 - outliers) / (2 * config.depth_range) + outliers / span
-    log_person = torch.where(in_front & near, math.log(usual), math.log(outliers / span))
-    at_background = (1 - outliers) * _normal(depth - background_depth, sigma) + outliers / span
-    log_background = torch.where(background_depth.isnan(), math.log(1 / span), at_background.log())
-    evidence = (log_person - log_background).clamp(-config.depth_weight, config.depth_weight)
-    evidence = torch.where(near, evidence, -2 * config.depth_weight)  # out, whatever the colour
-    unknown = depth.isnan()
-    lowest = window_min(evidence.masked_fill(unknown, math.inf), config.agreement)
-    highest = window_max(evidence.masked_fill(unknown, -math.inf), config.agreement)
-    # The least that all readings around agree on; without any, lowest is inf and highest -inf.
-    return torch.where(lowest <= highest, lowest.clamp_min(0) + highest.clamp_max(0), 0)
-
-
-def _person_depth(log_odds: Planes, depth: Planes, limit: Plane) -> Float[Tensor, " batch"]:
-    """Depth (m) about which most of the foreground lies, NaN if there is none: a smooth histogram's mode.
-
-    Of the foreground clearly in front of the background (`limit`, m), if there is any.
-    """
-    step, bins = 0.1, 200
-    log_odds, depth, limit = log_odds[:, ::2, ::2], depth[:, ::2, ::2], limit[::2, ::2]
-    counted = (log_odds > 0) & (depth > 0)
-    before = counted & (depth < limit)
-    counted = torch.where(before.flatten(1).any(1)[:, None, None], before, counted)
-    index = (torch.where(counted, depth, 0) / step).long().clamp_max(bins - 1).flatten(1)
-    votes = depth.new_zeros(len(depth), bins).scatter_add(1, index, counted.flatten(1).to(depth.dtype))
-    offsets = torch.arange(-10, 11, device=depth.device, dtype=depth.dtype) * step
-    kernel = torch.exp(-0.5 * (offsets / 0.3).square())  # 0.3 m: half a person's extent in depth
-    smooth = F.conv1d(votes[:, None], kernel[None, None], padding=10)[:, 0]
-    return torch.where(votes.sum(1) > 0, (smooth.argmax(1) + 0.5) * step, torch.nan)
-
-
-def _box(wanted: Bool[Tensor, "batch height width"], margin: int) -> tuple[slice, slice]:
-    """Rows and columns of all wanted pixels of all frames, and `margin` more where the image goes on.
-
-    Only of pixels whose four neighbours are wanted too: no other survives the opening, and noise has few.
-    """
-    inner = wanted[:, 1:-1, 1:-1] & wanted[:, :-2, 1:-1] & wanted[:, 2:, 1:-1]
-    inner = (inner & wanted[:, 1:-1, :-2] & wanted[:, 1:-1, 2:]).any(0)
-    slices = []
-    for found in (inner.any(1), inner.any(0)):
-        index = found.nonzero()[:, 0].tolist() or [0]
-        slices.append(slice(max(0, index[0] + 1 - margin), index[-1] + 2 + margin))
-    return slices[0], slices[1]
-
-
-def _largest_part(
-    mask: Bool[Tensor, "height width"],
-    bridged: Bool[Tensor, "height width"],
-    log_odds: Plane,
-    min_area: int,
-    max_hole: float,
-) -> Bool[Tensor, "height width"]:
-    """The largest part of `mask` that `bridged` connects, holes filled; empty if it is below `min_area` px.
-
-    By OpenCV, on the CPU: kornia's union-find labels the same image in five times as long.
-    """
-    _, labels = cv2.connectedComponents(bridged.cpu().numpy().astype(np.uint8), connectivity=8)
-    labels[~mask.cpu().numpy()] = 0
-    areas = np.bincount(labels.ravel())
-    areas[0] = 0
-    if areas.max() < min_area:
-        return torch.zeros_like(mask)
-    person = labels == areas.argmax()
-    count, holes, stats, _ = cv2.connectedComponentsWithStats((~person).astype(np.uint8), connectivity=4)
-    total = np.bincount(holes.ravel(), weights=log_odds.cpu().numpy().ravel(), minlength=count)
-    left, top, width, height, area = stats.T
-    inside = (left > 0) & (top > 0) & (left + width < mask.shape[1]) & (top + height < mask.shape[0])
-    filled = inside & ((area <= max_hole * areas.max()) | (total > -2.5 * area))
-    filled[0] = True  # label 0 of the holes is the person
-    return torch.from_numpy(filled[holes]).to(mask.device)
 
 
 def _clean_depth(
