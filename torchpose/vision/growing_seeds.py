@@ -85,8 +85,8 @@ class GrowingSeeds(StereoMatcher):
     6. Islands of matches too small to trust go, holes are filled from their rims, and what is left is
        smoothed.
 
-    Steps 1 to 5 are the paper's, the sixth is ours. The confidence is the similarity, halved if filled in. The memory is 8 bytes a cell over the
-    masks' bounding box: 250 MB for 640 x 480 with 97 disparities.
+    Steps 1 to 5 are the paper's, the sixth is ours. The confidence is the similarity, halved if filled in. The
+    memory is 8 bytes a cell over the masks' bounding box: 250 MB for 640 x 480 with 97 disparities.
     """
 
     def __init__(self, config: GrowingSeedsConfig = GrowingSeedsConfig()) -> None:

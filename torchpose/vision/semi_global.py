@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Int16, Int64, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn import functional as F
 
 from torchpose.vision.disparity import Disparity, Grey, StereoMatcher, smooth, without_islands
 from torchpose.vision.disparity_space import crop_beyond
@@ -249,21 +248,19 @@ def winners(
     region = region.transpose(0, 1)
     highest = torch.iinfo(torch.int16).max
     # A cost and its layer in one number: the least number has the least cost.
-    best: Int16[Tensor, "height batch width"] = torch.full(
-        (height, count, width), highest, dtype=torch.int16, device=total.device
-    )
+    best = torch.full((height, count, width), highest, dtype=torch.int16, device=total.device)
     right_best = best.new_full((height, count, width + layers - 1), highest)
     elsewhere = (~region).to(torch.int16) * (highest - MOST_LAYERS + 1)
     packed = torch.empty_like(best)
-    for layer in range(layers):
-        packed.copy_(total[:, :, layer])
+    for index in range(layers):
+        packed.copy_(total[:, :, index])
         packed <<= LAYER_BITS
         packed |= elsewhere
-        packed += layer
+        packed += index
         torch.minimum(best, packed, out=best)
-        seen = right_best[..., layers - 1 - layer : layers - 1 - layer + width]
+        seen = right_best[..., layers - 1 - index : layers - 1 - index + width]
         torch.minimum(seen, packed, out=seen)
-    layer: Int64[Tensor, "height batch width"] = (best & (MOST_LAYERS - 1)).long()
+    layer = (best & (MOST_LAYERS - 1)).long()
     match = torch.arange(width, device=total.device) - layer
     other = right_best.gather(2, match + layers - 1) & (MOST_LAYERS - 1)
     agreed = region & (match >= -reach[0]) & (match <= reach[1]) & ((other - layer).abs() <= consistency)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchpose.vision.disparity import Disparity, Grey, StereoMatcher
+from torchpose.vision.disparity import Disparity, Grey, StereoMatcher, smooth
 from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
 from torchpose.vision.semi_global import SemiGlobal, SemiGlobalConfig
 
@@ -31,10 +31,13 @@ class OpenCVConfig:
     speckle_window: int = 100  # px, least area
     speckle_range: int = 2  # px
     left_right: int = 1  # px by which both directions may differ
+    smoothing: int = 2  # px, radius of the last mean over neighbours within 1 px of disparity
 
     def __post_init__(self) -> None:
         if self.block_size < 1 or self.block_size % 2 == 0:
             raise ValueError(f"block_size must be odd, got {self.block_size}; 5 is usual")
+        if self.smoothing < 0:
+            raise ValueError(f"smoothing must not be negative, got {self.smoothing}; 0 turns it off")
 
 
 class OpenCVMatcher(StereoMatcher):
@@ -81,7 +84,7 @@ class OpenCVMatcher(StereoMatcher):
             found = torch.from_numpy(matcher.compute(*images).astype(np.float32) / 16).to(left)
             found = found.where((found >= least) & (found <= greatest), torch.nan)
             values[index, above:below, start:end] = found
-        values = values.where(mask, torch.nan)
+        values = smooth(values.where(mask, torch.nan), config.smoothing)
         return Disparity(values, (~values.isnan()).to(left.dtype))
 
 
