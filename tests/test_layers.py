@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "torchpose"
 # may import one another, also those that the design names and that are still to come. A new file takes its
 # place here first.
 ROOMS: dict[str, tuple[str, ...]] = {
-    "the ground": ("version", "atomic", "settings", "geometry", "least_squares"),
+    "the ground": ("version", "atomic", "image_file", "settings", "geometry", "least_squares"),
     "vision": (
         "camera",
         "windows",
@@ -25,6 +25,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "background",
         "scene_match",
         "silhouette",
+        "focal_length",
         "points",
         "faces",
         "alignment",
@@ -40,7 +41,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "synthesis": ("motion", "room", "render", "database"),
     "learning": ("part_network", "training"),
     "the desk": (
-        *("depthai", "calibration", "image_file", "video", "recording", "rendered", "export", "figures"),
+        *("depthai", "calibration", "video", "recording", "rendered", "export", "figures"),
         *("pipeline", "session", "clips", "study", "cli"),
     ),
 }

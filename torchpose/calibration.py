@@ -25,10 +25,12 @@ _KEYS = (
     "frame_rate",
     "rectified",
     "depth_unit",
+    "person_height",
     *RAW_KEYS,
 )
 _LONGEST_BASELINE = 5.0  # m; a longer one was given in mm or cm
 _SHORTEST_FOCAL_LENGTH = 0.1  # image widths, a view of 157 degrees; a shorter one was given in mm
+_SHORTEST_PERSON, _TALLEST_PERSON = 0.5, 2.6  # m
 _COARSEST_DEPTH_UNIT = 0.1  # m; a coarser one is the number of steps in a metre
 
 
@@ -39,6 +41,8 @@ class Calibration:
     camera: StereoCamera  # after rectification
     raw: RawStereo | None = None  # how to rectify; None: the images are rectified already
     depth_unit: float | None = None  # m per step of the depth images; None: a stereo pair
+    # m, of the person, from whom the focal length is to be estimated: the camera's is but a place holder; None: known
+    person_height: float | None = None
 
 
 def read_calibration(
@@ -48,8 +52,9 @@ def read_calibration(
 
     Always `image_size` [width, height] px and `frame_rate` Hz. Rectified stereo: `focal_length` px,
     `principal_point` [cx, cy] px, `baseline` m, `rectified: true`. A depth camera: the same with `depth_unit`
-    (m per step of its images) instead of `baseline`. Raw stereo: OpenCV's `K1, D1, K2, D2, R, T` (m) instead.
-    Other keys are left alone. DepthAI: see `depthai_stereo`.
+    (m per step of its images) instead of `baseline`; with `person_height` (m) instead of `focal_length`, if that is not
+    known, and the image's centre as `principal_point`, if none is given. Raw stereo: OpenCV's
+    `K1, D1, K2, D2, R, T` (m) instead. Other keys are left alone. DepthAI: see `depthai_stereo`.
 
     Args:
         path: the file.
@@ -69,6 +74,9 @@ def read_calibration(
 
 
 def _rectified(values: dict[str, Any]) -> Calibration:
+    person_height = _person_height(values)
+    if person_height is not None:
+        values = {"rectified": True, **values}  # one camera has no other to agree with
     if _require(values, "rectified", "true: a point lies on the same row of both images") is not True:
         raise ValueError(
             f"rectified must be true, got {values['rectified']!r}; "
@@ -79,6 +87,8 @@ def _rectified(values: dict[str, Any]) -> Calibration:
             "there must be a baseline (stereo pair) or a depth_unit (depth camera), got both; remove one"
         )
     width, height = _image_size(values)
+    if person_height is not None:
+        values = {"focal_length": width, "principal_point": [(width - 1) / 2, (height - 1) / 2], **values}
     focal_length = _positive(values, "focal_length", "px")
     if focal_length < _SHORTEST_FOCAL_LENGTH * width:
         raise ValueError(
@@ -99,8 +109,31 @@ def _rectified(values: dict[str, Any]) -> Calibration:
         baseline = _positive(values, "baseline", "m", "for a depth camera give depth_unit instead")
         _check_length("baseline", baseline)
     return Calibration(
-        StereoCamera(width, height, focal_length, cx, cy, baseline, frame_rate), None, depth_unit
+        StereoCamera(width, height, focal_length, cx, cy, baseline, frame_rate),
+        depth_unit=depth_unit,
+        person_height=person_height,
     )
+
+
+def _person_height(values: dict[str, Any]) -> float | None:
+    """Of the person who stands in for a focal length, m; None where none is given."""
+    if "person_height" not in values:
+        return None
+    if "depth_unit" not in values:
+        raise ValueError(
+            "person_height must come with a depth_unit (a depth camera), got none; remove it, or add depth_unit"
+        )
+    if "focal_length" in values:
+        raise ValueError(
+            "there must be a focal_length or a person_height to estimate it from, got both; remove one"
+        )
+    height = _positive(values, "person_height", "m")
+    if not _SHORTEST_PERSON <= height <= _TALLEST_PERSON:
+        raise ValueError(
+            f"person_height must be in m, {_SHORTEST_PERSON:g} to {_TALLEST_PERSON:g}, got {height:g}; "
+            "divide centimetres by 100"
+        )
+    return height
 
 
 def _raw(values: dict[str, Any]) -> Calibration:

@@ -6,7 +6,7 @@ are on the CPU and rectified; depth belongs to the left camera, whose frame is x
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -28,11 +28,14 @@ from torchpose.image_file import (
     write_image,
 )
 from torchpose.video import VideoFile
+from torchpose.vision.background import far_readings
 from torchpose.vision.camera import StereoCamera
+from torchpose.vision.focal_length import focal_length_of_person
 
 CALIBRATION = "calibration.yaml"
 BACKGROUND = "background"
 _RATE_TOLERANCE = 0.01  # relative; frame rates that differ by more are not the same
+_PERSON_FRAMES = 15  # over the recording, in which a person is looked for whose height is known
 _LATE_END = 1.0  # s, by which one of two videos may end later than the other
 
 
@@ -88,7 +91,7 @@ class FolderRecording:
     def __init__(self, folder: Path, calibration: Calibration, background: Path | None = None) -> None:
         self.folder = folder
         self.calibration = calibration
-        self._background = background or folder / BACKGROUND
+        self.background_folder = background or folder / BACKGROUND
         if calibration.depth_unit is None:
             streams = ["left", "right"]
         else:
@@ -130,7 +133,7 @@ class FolderRecording:
 
         Raises ValueError where one cannot be read, or where the left and the right ones do not pair up.
         """
-        return _backgrounds(self._background, self.calibration)
+        return _backgrounds(self.background_folder, self.calibration)
 
     def _read(self, stream: str, path: Path) -> Float[Tensor, "*channels height width"]:
         return _read_image(path, self.calibration, stream == "depth")
@@ -289,12 +292,44 @@ def open_recording(
     file = path / CALIBRATION if calibration is None else Path(calibration)
     videos = [VideoFile(video) for side in ("left", "right") for video in _video_in(path, side)]
     if not videos:
-        return FolderRecording(path, read_calibration(file), scene)
+        recording = FolderRecording(path, read_calibration(file), scene)
+        height = recording.calibration.person_height
+        return recording if height is None else _with_focal_length(recording, height)
     if len(videos) != 2:
         raise ValueError(
             f"there must be a left.* and a right.* video, got only {videos[0].path}; add the other one"
         )
     return _video_recording(videos, file, scene or path / BACKGROUND)
+
+
+def _with_focal_length(recording: FolderRecording, height: float) -> FolderRecording:
+    """The recording by a camera whose focal length is estimated from a person who is `height` m tall."""
+    frames = []
+    for position in (
+        np.linspace(0, len(recording) - 1, min(len(recording), _PERSON_FRAMES)).round().astype(int)
+    ):
+        try:
+            frames.append(recording[int(position)].depth)
+        except UnreadableFrame:
+            continue
+    empty, camera = recording.background().depth, recording.camera
+    try:
+        if not frames:
+            raise ValueError("there must be a frame that can be read, got none; check the recording")
+        depth = torch.stack([frame for frame in frames if frame is not None])
+        focal_length = focal_length_of_person(
+            depth, far_readings(depth) if empty is None else empty, height, camera.cy
+        )
+    except ValueError as error:
+        raise ValueError(f"{recording.folder}: {error}") from None
+    warnings.warn(
+        f"the focal length was estimated as {focal_length:.0f} px from a person of {height:g} m; all lengths are as "
+        "right as that",
+        stacklevel=3,
+    )
+    camera = replace(camera, focal_length=focal_length)
+    known = replace(recording.calibration, camera=camera, person_height=None)
+    return FolderRecording(recording.folder, known, recording.background_folder)
 
 
 def _video_recording(
