@@ -41,8 +41,10 @@ from torchpose.vision.background import (
     far_readings,
 )
 from torchpose.vision.camera import StereoCamera
+from torchpose.vision.empty_scene import EmptySceneConfig, learn_empty_scene
 from torchpose.vision.faces import FaceConfig, FaceDetector, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds
+from torchpose.vision.photometry import temporal_median
 from torchpose.vision.points import CellConfig, PointCloud, SamplingConfig, group_cells, sample_grid
 from torchpose.vision.scene_match import SceneMatch, SceneMatchConfig
 from torchpose.vision.silhouette import SilhouetteConfig, person_silhouette, search_region
@@ -57,6 +59,7 @@ class EyesConfig:
     farthest: float = 8.0  # m
     background_frames: int = 15  # of the recording, from which the empty scene is learned if none is given
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    empty_scene: EmptySceneConfig = field(default_factory=EmptySceneConfig)
     depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
     scene_match: SceneMatchConfig = field(default_factory=SceneMatchConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
@@ -65,7 +68,8 @@ class EyesConfig:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     face: FaceConfig = field(default_factory=FaceConfig)
     range_scale: int = 4  # by which images are shrunk to find the person's range of disparities
-    range_margin: float = 0.8  # m before its near end: an arm may be too thin for the small images
+    glance_margin: float = 0.8  # m around it: an arm may be too thin for the small images
+    last_margin: float = 0.5  # m around the last frame's range
     least_matched: float = 0.7  # share of the foreground; with less the range was wrong, and all is searched
     min_points: int = 60  # fewer points on the person are nobody
 
@@ -106,6 +110,15 @@ class Sight:
     cut: bool  # the silhouette meets the image's border
 
 
+@dataclass(frozen=True)
+class LastSight:
+    """What the next frame is told of this one."""
+
+    time_s: float
+    silhouette: Bool[Tensor, "1 height width"]
+    disparity: Float[Tensor, "1 height width"] | None  # px, of the person alone; None: a depth camera
+
+
 class Stopwatch:
     """Processor time by stage, s."""
 
@@ -135,8 +148,7 @@ class Eyes(nn.Module):
         self.background: BackgroundModel | DepthBackground | None = None
         self.background_depth: Tensor | None = None
         self.scene_match: SceneMatch | None = None
-        self.last_time = -math.inf  # s, of the frame that `last_mask` belongs to
-        self.last_mask: Tensor | None = None
+        self.last: LastSight | None = None
 
     @property
     def disparity_range(self) -> tuple[int, int]:
@@ -149,25 +161,30 @@ class Eyes(nn.Module):
         left: Float[Tensor, "1 3 height width"],
         right: Float[Tensor, "1 3 height width"],
         region: Bool[Tensor, "1 height width"],
+        last: Float[Tensor, "1 height width"] | None,
     ) -> tuple[int, int]:
-        """Disparities to search in this frame, px: up to the person's nearest, from a look at a small copy of it.
+        """Disparities to search in this frame, px: around the last frame's person, or around what a small copy shows.
 
-        The cost of matching is that of the disparities searched, and most of those that `nearest` allows lie
-        before the person. The far end stays: a shadow on the wall must find its match there, or it finds a wrong
-        one on the person.
+        The cost of matching is that of the disparities searched, and most of those that `nearest` and `farthest`
+        allow lie before and behind the person.
         """
         low, high = self.disparity_range
-        shrink = self.config.range_scale
-        size = (left.shape[2] // shrink, left.shape[3] // shrink)
-        small = [torch.nn.functional.interpolate(image, size, mode="area") for image in (left, right)]
-        mask = torch.nn.functional.interpolate(region[:, None].to(left), size, mode="area")[:, 0] > 0
-        found = self.glance(*small, mask, disparity_range=(low // shrink, -(-high // shrink))).values
-        values = shrink * found[found.isfinite()]
-        if len(values) < self.config.min_points:
+        margin = self.config.last_margin
+        if last is None:
+            shrink, margin = self.config.range_scale, self.config.glance_margin
+            size = (left.shape[2] // shrink, left.shape[3] // shrink)
+            small = [torch.nn.functional.interpolate(image, size, mode="area") for image in (left, right)]
+            mask = torch.nn.functional.interpolate(region[:, None].to(left), size, mode="area")[:, 0] > 0
+            last = (
+                shrink * self.glance(*small, mask, disparity_range=(low // shrink, -(-high // shrink))).values
+            )
+        depth = self.camera.depth(last[last.isfinite()])
+        if len(depth) < self.config.min_points:
             return low, high
-        near = float(self.camera.depth(values.quantile(0.99))) - self.config.range_margin
-        many = float(self.camera.disparity(torch.tensor(max(near, self.config.nearest))))
-        return low, min(high, math.ceil(many))
+        near, far = (float(depth.quantile(share)) for share in (0.01, 0.99))
+        ends = self.camera.disparity(torch.tensor([far + margin, max(near - margin, self.config.nearest)]))
+        least, greatest = ends.tolist()
+        return max(low, math.floor(least)), min(high, math.ceil(greatest))
 
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
         """Learn the empty scene from its frames, or where there are none from the recording itself."""
@@ -181,19 +198,42 @@ class Eyes(nn.Module):
             return
         if backgrounds.left is not None and backgrounds.right is not None:
             left, right = backgrounds.left.to(device), backgrounds.right.to(device)
-            self.background = BackgroundModel(left, self.config.background)
+            with self.stopwatch.measure("background"):
+                pair = left.median(0, keepdim=True).values, right.median(0, keepdim=True).values
+                disparity = self.stereo(*pair, disparity_range=(0, self.disparity_range[1])).values[0]
         else:
             frames = list(_readable(recording, spread))
             left, right = (
                 _stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right")
             )
-            self.background = BackgroundModel.from_recording(left, self.config.background)
-            left, right = left.median(0, keepdim=True).values, right.median(0, keepdim=True).values
-        with self.stopwatch.measure("background"):
-            disparity = self.stereo(left[:1], right[:1], disparity_range=(0, self.disparity_range[1]))
-            self.background_depth = self.camera.depth(disparity.values)[0]
-            empty = rgb_to_grayscale(torch.stack([left.median(0).values, right.median(0).values]))[:, 0]
-            self.scene_match = SceneMatch(empty[0], empty[1], disparity.values[0], self.config.scene_match)
+            with self.stopwatch.measure("background"):
+                scene = learn_empty_scene(
+                    left, right, self.stereo, self.camera, (0, self.disparity_range[1]), self.config.empty_scene
+                )
+            left, right, disparity = scene.left, scene.right, scene.disparity
+        self.background = BackgroundModel(left, self.config.background)
+        self.background_depth = self.camera.depth(disparity)
+        empty = rgb_to_grayscale(torch.stack([temporal_median(left), temporal_median(right)]))[:, 0]
+        self.scene_match = SceneMatch(empty[0], empty[1], disparity, self.config.scene_match)
+
+    def state(self) -> dict[str, Tensor]:
+        """What is remembered of the last frame, to go on from there; {} if there was none."""
+        if self.last is None:
+            return {}
+        time_s = torch.tensor(self.last.time_s, dtype=torch.float64)
+        state = {"time_s": time_s, "silhouette": self.last.silhouette}
+        return state if self.last.disparity is None else state | {"disparity": self.last.disparity}
+
+    def restore(self, state: dict[str, Tensor], device: torch.device) -> None:
+        """Take up what `state` gave."""
+        self.last = None
+        if state:
+            disparity = state.get("disparity")
+            self.last = LastSight(
+                float(state["time_s"]),
+                state["silhouette"].to(device),
+                None if disparity is None else disparity.to(device),
+            )
 
     def forward(self, frame: Frame, device: torch.device) -> Sight:
         """Look at one frame."""
@@ -201,6 +241,7 @@ class Eyes(nn.Module):
             raise ValueError(
                 "the background must be learned before a frame is looked at; call learn_background"
             )
+        last = self.last if self.last and 0 < frame.time_s - self.last.time_s < self.config.memory else None
         if frame.depth is not None:
             depth = frame.depth[None].to(device)
             images = frame.left[None].to(device) if frame.left is not None else depth_picture(depth)
@@ -218,15 +259,15 @@ class Eyes(nn.Module):
                 log_odds = log_odds + self.scene_match(grey[:1], grey[1:], region)
                 region = search_region(log_odds, self.config.silhouette)
             with self.stopwatch.measure("stereo"):
-                span = self.person_range(images, right, region)
-                disparity = self.stereo(images, right, region, disparity_range=span)
+                seeds = last.disparity if last else None
+                span = self.person_range(images, right, region, seeds)
+                disparity = self.stereo(images, right, region, seeds, span)
                 changed = log_odds > 0
-                matched = float((disparity.values.isfinite() & changed).sum() / changed.sum().clamp_min(1))
-                if span != self.disparity_range and matched < self.config.least_matched:
-                    disparity = self.stereo(images, right, region, disparity_range=self.disparity_range)
+                share = float((disparity.values.isfinite() & changed).sum() / changed.sum().clamp_min(1))
+                if span != self.disparity_range and share < self.config.least_matched:
+                    disparity = self.stereo(images, right, region, None, self.disparity_range)
                 depth = self.camera.depth(disparity.values)
         with self.stopwatch.measure("silhouette"):
-            recent = 0 < frame.time_s - self.last_time < self.config.memory
             silhouette = person_silhouette(
                 log_odds,
                 depth,
@@ -234,9 +275,11 @@ class Eyes(nn.Module):
                 self.background_depth,
                 self.camera,
                 guide=rgb_to_grayscale(images)[:, 0],
-                previous=self.last_mask if recent else None,
+                previous=last.silhouette if last else None,
             ).mask
-            self.last_time, self.last_mask = frame.time_s, silhouette
+            seen = depth.where(silhouette, torch.nan)
+            matched = None if self.camera.baseline is None else self.camera.disparity(seen)
+            self.last = LastSight(frame.time_s, silhouette, matched)
         with self.stopwatch.measure("points"):
             cloud = sample_grid(depth, silhouette, self.camera, self.config.sampling)
         with self.stopwatch.measure("faces"):

@@ -36,6 +36,7 @@ from torchpose.pipeline import FramePose, StereoToPose, depth_picture
 from torchpose.recording import Recording, UnreadableFrame
 
 PART = 50  # frames between two savings: what an interruption costs at the most
+_EYES = "eyes_"  # before the names of the eyes' state, beside the tracker's
 _SHOWN = ("elbow_flexion_left", "elbow_flexion_right", "knee_flexion_left", "knee_flexion_right")
 
 
@@ -99,10 +100,13 @@ class Session:
         if not files:
             return 0
         state = np.load(files[-1].with_name(files[-1].name.replace("poses", "state")))
-        self.model.tracker.restore(
-            {name: torch.from_numpy(state[name]) for name in state.files if name != "size"}
-        )
-        self.model.size = torch.from_numpy(state["size"]).to(self.model.device)
+        tensors = {name: torch.from_numpy(state[name]) for name in state.files}
+        self.model.size = tensors.pop("size").to(self.model.device)
+        seen = {
+            name.removeprefix(_EYES): tensors.pop(name) for name in list(tensors) if name.startswith(_EYES)
+        }
+        self.model.eyes.restore(seen, self.model.device)
+        self.model.tracker.restore(tensors)
         return sum(len(read_poses_npz(file)) for file in files)
 
     def _files(self) -> list[Path]:
@@ -139,9 +143,11 @@ class Session:
                 labels[i, seen] = frame.registration.belief[0].argmax(0).cpu()[seen]
         with replacing(self.parts / f"points_{end:08d}.npz") as partial:
             np.savez(partial, pixels=pixels, labels=labels)
-        state = {name: value.cpu().numpy() for name, value in self.model.tracker.state().items()}
+        kept = self.model.tracker.state() | {"size": self.model.size}
+        kept |= {_EYES + name: value for name, value in self.model.eyes.state().items()}
+        state = {name: value.cpu().numpy() for name, value in kept.items()}
         with replacing(self.parts / f"state_{end:08d}.npz") as partial:
-            np.savez(partial, allow_pickle=False, size=self.model.size.cpu().numpy(), **state)
+            np.savez_compressed(partial, allow_pickle=False, **state)
         write_poses_npz(self.parts / f"poses_{end:08d}.npz", self.model.sequence(frames))
 
     def _collect(self) -> tuple[PoseSequence, _Labelled]:

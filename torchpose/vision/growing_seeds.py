@@ -166,18 +166,18 @@ def given_seeds(
     arm that was elsewhere, every fourth pixel takes the part of a Harris point.
     """
     layer = (seeds - (space.least - 1)).round()
-    known = mask & (layer >= 1) & (layer <= space.disparities)
-    pixel = space.pixel(known.flatten().nonzero()[:, 0])
-    reach = torch.arange(-config.seed_shift, config.seed_shift + 1, device=pixel.device)[:, None]
-    near = space.cell(pixel, (layer[known].long() + reach).clamp(1, space.disparities))  # (shifts, seeds)
+    known = (mask & (layer >= 1) & (layer <= space.disparities)).flatten().nonzero()[:, 0]
+    reach = torch.arange(-config.seed_shift, config.seed_shift + 1, device=known.device)[:, None]
+    about = (layer.flatten()[known].long() + reach).clamp(1, space.disparities)  # (shifts, seeds)
+    near = space.cell(space.pixel(known).expand_as(about), about)
     best, shift = volume.index_select(0, near.flatten()).view(near.shape).max(dim=0, keepdim=True)
     good = (best[0] >= config.tau).nonzero()[:, 0]
-    pixel, cells = pixel.index_select(0, good), near.gather(0, shift)[0].index_select(0, good)
+    cells = near.gather(0, shift)[0].index_select(0, good)
 
-    open_ = space.pad(mask, False).index_fill(0, pixel, False)
-    lattice = torch.zeros_like(space.unpad(open_))
+    silent = mask.flatten().index_fill(0, known.index_select(0, good), False).view(mask.shape)
+    lattice = torch.zeros_like(mask)
     lattice[:, ::2, ::2] = True
-    others = space.pixel((space.unpad(open_) & lattice).flatten().nonzero()[:, 0])
+    others = space.pixel((silent & lattice).flatten().nonzero()[:, 0])
     return torch.cat([cells, similar_cells(volume, others, space, config)])
 
 
