@@ -247,7 +247,7 @@ def test_real_and_rendered_pairs_moved_by_a_known_amount(shared_data: Path, pair
         files = [[folder / "left.png", folder / "right.png"]]
     lefts, rights = ([read(file) for file in side] for side in zip(*files, strict=True))
     left = spoiled(torch.cat([image(grey) for grey in lefts]))
-    for dy in (0.0, 0.25, 1.0, 2.0):
+    for dy in (0.0, 0.25, 2.0):
         move = np.array([[1, 0, 0], [0, 1, dy]], np.float32)
         size = lefts[0].shape[::-1]
         moved = [cv2.warpAffine(grey, move, size, flags=cv2.INTER_CUBIC) for grey in rights]
