@@ -21,8 +21,8 @@ LAYER_BITS = 7  # of the 15 bits that hold a summed cost and its layer
 MOST_LAYERS = 2**LAYER_BITS
 WORD = 8  # bytes, pixels that are counted at a time
 
-Census = UInt8[Tensor, "bytes batch height width"]
-Volume = UInt8[Tensor, "height batch layers width"]  # the rows first: a path's step is one piece of memory
+Census = UInt8[Tensor, "bytes batch h w"]
+Volume = UInt8[Tensor, "h batch layers w"]  # the rows first: a path's step is one piece of memory
 
 
 @dataclass(frozen=True)
