@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torchpose as tp
-from torchpose import session
+from torchpose import cli, session
 from torchpose.cli import CONFIGS, infer_main, load_config
 from torchpose.export import JOINT_NAMES, pose_columns
 from torchpose.recording import Backgrounds, write_recording
@@ -181,12 +181,13 @@ def test_a_depth_camera_s_recording_runs_too(synthetic: SyntheticRecording, tmp_
     assert (sequence.joints - synthetic.joints[:2].to(sequence.joints))[:, 3:].norm(dim=-1).mean() < 0.08
 
 
-@pytest.mark.filterwarnings("always")
+@pytest.mark.filterwarnings("always::UserWarning")
 def test_a_side_by_side_video_s_poses_are_right_and_its_other_frame_rate_is_said(
     synthetic: SyntheticRecording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """The renderer's pairs as one lossless video at 12 Hz, by a calibration that says 10."""
-    camera, shots = synthetic.camera, list(synthetic)[:3]
+    camera = synthetic.camera
+    shots = [shot for _, shot in zip(range(2), synthetic, strict=False)]
     write_recording(
         tmp_path / "empty", camera, [tp.Frame(0, 0.0, *(image[0] for image in synthetic.background(1)))]
     )
@@ -206,9 +207,78 @@ def test_a_side_by_side_video_s_poses_are_right_and_its_other_frame_rate_is_said
     )
     assert error.count("\n") == 1
     sequence = tp.read_poses_csv(tmp_path / "out" / "poses.csv")
-    assert sequence.time_s.tolist() == [0, 0.1, 0.2]
+    assert sequence.time_s.tolist() == [0, 0.1]
     assert all(sequence.answered)
-    assert (sequence.joints - synthetic.joints[:3].to(sequence.joints))[:, 3:].norm(dim=-1).mean() < 0.08
+    assert (sequence.joints - synthetic.joints[:2].to(sequence.joints))[:, 3:].norm(dim=-1).mean() < 0.08
+
+
+def test_a_live_camera_is_recorded_and_then_run(
+    synthetic: SyntheticRecording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    """A video file stands in for the device."""
+    shots = [shot for _, shot in zip(range(3), synthetic, strict=False)]
+    path = tmp_path / "device.avi"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"FFV1"), 10, (640, 240))
+    for shot in shots:
+        pair = torch.cat([shot.left[0], shot.right[0]], dim=2)
+        writer.write(np.ascontiguousarray((pair * 255).round().byte().permute(1, 2, 0).numpy()[..., ::-1]))
+    writer.release()
+    left, right = synthetic.background(1)
+    write_recording(tmp_path / "rig", synthetic.camera, [tp.Frame(0, 0.0, left[0], right[0])])
+    (tmp_path / "empty").mkdir()
+    for side in ("left", "right"):
+        (tmp_path / "rig" / side / "000000.png").rename(tmp_path / "empty" / f"{side}_0.png")
+    rig = [f"calibration={tmp_path / 'rig' / 'calibration.yaml'}", f"background={tmp_path / 'empty'}"]
+    command = ["recording=camera:0", *rig, f"output={tmp_path / 'out'}", "max_frames=2", *QUICK]
+    opened = []
+    monkeypatch.setattr(
+        cli, "open_cameras", lambda numbers: opened.append(numbers) or [cv2.VideoCapture(str(path))]
+    )
+    assert infer_main(command) == 0
+    assert opened == [(0,)]
+    output = capsys.readouterr().out
+    assert f"recording 2 frames into {tmp_path / 'out' / 'recording'}, Ctrl-C ends it" in output
+    assert "recorded 2 frames in 0.1 s, 0 dropped" in output
+    sequence = tp.read_poses_csv(tmp_path / "out" / "poses.csv")
+    assert all(sequence.answered)
+    assert (sequence.joints - synthetic.joints[:2].to(sequence.joints))[:, 3:].norm(dim=-1).mean() < 0.08
+    # The recording stays, runs again as a folder, and is not lost to the same command.
+    recording = tp.open_recording(tmp_path / "out" / "recording")
+    assert len(recording) == 2
+    assert recording.background().left.shape == (1, 3, 240, 320)
+    assert infer_main(command) == 2
+    assert "recording runs that, and fresh=true or another output records anew" in capsys.readouterr().err
+    monkeypatch.setattr(cli.Session, "run", lambda *_: None)
+    monkeypatch.setattr(cli, "summary_table", lambda *_: "")
+    assert infer_main([*command, "fresh=true", "max_frames=3"]) == 0
+    assert len(tp.open_recording(tmp_path / "out" / "recording")) == 3
+
+
+def test_a_live_camera_needs_its_settings_and_a_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    camera = [
+        "recording=camera:87+88",
+        f"calibration={tmp_path}",
+        "max_frames=2",
+        f"output={tmp_path / 'out'}",
+    ]
+    for command, message in (
+        (camera, "camera:87 must be a camera of this machine, got none that can be opened; plug it in"),
+        (camera[:2], "max_frames must be given for a live camera, got null; add max_frames="),
+        (camera[::2], "calibration must be given for a live camera, got null; add calibration="),
+        ([*camera, "right=b.mp4"], "right must be a video beside a left one, got b.mp4 beside a camera"),
+        (
+            ["recording=camera:1+1"],
+            "must be camera:N, a side-by-side stereo camera, or camera:N+M, two cameras",
+        ),
+    ):
+        assert infer_main(command) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def damage(folder: Path, kind: str) -> None:

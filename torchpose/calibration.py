@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from torchpose.atomic import replacing
 from torchpose.depthai import depthai_stereo
 from torchpose.vision.camera import RawStereo, StereoCamera
 
@@ -71,6 +72,24 @@ def read_calibration(
         return _raw(values) if any(key in values for key in RAW_KEYS) else _rectified(values)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def write_calibration(path: str | Path, calibration: Calibration) -> None:
+    """Write a calibration as YAML that `read_calibration` reads to the same numbers; the file appears whole."""
+    camera, raw = calibration.camera, calibration.raw
+    values: dict[str, Any] = {"image_size": [camera.width, camera.height], "frame_rate": camera.frame_rate}
+    if raw is not None:
+        values |= {key: getattr(raw, key).tolist() for key in RAW_KEYS}
+    elif calibration.person_height is not None:
+        values |= {"depth_unit": calibration.depth_unit, "person_height": calibration.person_height}
+        values |= {"principal_point": [camera.cx, camera.cy]}
+    else:
+        values |= {"focal_length": camera.focal_length, "principal_point": [camera.cx, camera.cy]}
+        stereo = calibration.depth_unit is None
+        values |= {"baseline": camera.baseline} if stereo else {"depth_unit": calibration.depth_unit}
+        values |= {"rectified": True}
+    with replacing(Path(path)) as partial:
+        partial.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
 
 
 def _rectified(values: dict[str, Any]) -> Calibration:

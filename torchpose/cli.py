@@ -16,6 +16,7 @@ import torch
 from torchpose.activity.dataset import Clip, Fold, Split, read_skeletons, split_clips
 from torchpose.activity.features import FeatureKind
 from torchpose.activity.recognizer import RecognizerConfig
+from torchpose.capture import camera_numbers, capture_recording, open_cameras
 from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
@@ -46,13 +47,13 @@ Kind = Literal["infer", "train"]
 class InferConfig:
     """Recover a person's joint angles from a recording by a stereo or depth camera."""
 
-    # folder of the recording, a side-by-side stereo video, or a left video; null: one that the package makes itself
+    # folder, side-by-side stereo video, left video, camera:0 (side by side) or camera:0+1; null: the package makes one
     recording: str | None = None
     right: str | None = None  # the right video, where `recording` is the left one
-    calibration: str | None = None  # its file, instead of the folder's own; a video needs one
+    calibration: str | None = None  # its file, instead of the folder's own; a video or a camera needs one
     background: str | None = None  # folder with images of the empty scene, instead of the folder's own
     output: str = "runs/infer"  # folder for the results
-    max_frames: int | None = None  # take only the first so many frames
+    max_frames: int | None = None  # take only the first so many frames; a camera needs it
     fresh: bool = False  # start over instead of continuing an interrupted run
     seed: int = 0  # the same seed gives the same results
     device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
@@ -64,6 +65,14 @@ class InferConfig:
         given = [name for name in ("right", "calibration", "background") if getattr(self, name) is not None]
         if self.recording is None and given:
             raise ValueError(f"{given[0]} must come with a recording, got none; give recording=PATH as well")
+        if self.recording is not None and camera_numbers(self.recording) is not None:
+            for name in ("calibration", "max_frames"):
+                if getattr(self, name) is None:
+                    raise ValueError(f"{name} must be given for a live camera, got null; add {name}=")
+            if self.right is not None:
+                raise ValueError(
+                    f"right must be a video beside a left one, got {self.right} beside a camera; leave it out"
+                )
         if self.max_frames is not None and self.max_frames < 1:
             raise ValueError(f"max_frames must be at least 1, got {self.max_frames}; null takes all frames")
         _check_machine(self.seed, self.threads)
@@ -147,15 +156,38 @@ def train_main(argv: Sequence[str]) -> int:
 
 def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
+    output = Path(config.output)
     if config.recording is None:
         print("no recording given: making one (recording=DIR runs yours)")
         recording: Recording = demo_recording(config.seed)
     else:
+        config = _captured(config, output / "recording")
+        assert config.recording is not None
         recording = open_recording(config.recording, config.right, config.calibration, config.background)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    output = Path(config.output)
     session = Session(model, recording, output, settings_of(config), __version__)
     print(summary_table(session.run(config.fresh, config.max_frames), output))
+
+
+def _captured(config: InferConfig, folder: Path) -> InferConfig:
+    """The configuration that runs what was recorded into `folder`, where the recording is a live camera."""
+    assert config.recording is not None
+    numbers = camera_numbers(config.recording)
+    if numbers is None:
+        return config
+    assert config.calibration is not None
+    assert config.max_frames is not None
+    devices = open_cameras(numbers)
+    if config.fresh:
+        shutil.rmtree(folder, ignore_errors=True)
+    print(f"recording {config.max_frames} frames into {folder}, Ctrl-C ends it")
+    try:
+        capture = capture_recording(devices, folder, config.calibration, config.max_frames, config.background)
+    finally:
+        for device in devices:
+            device.release()
+    print(f"recorded {capture.frames} frames in {capture.seconds:.1f} s, {capture.dropped} dropped")
+    return replace(config, recording=str(folder), calibration=None, background=None)
 
 
 def train(config: TrainConfig, device: torch.device) -> None:

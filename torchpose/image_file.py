@@ -92,6 +92,11 @@ def write_image(path: Path, image: Tensor | None, suffix: str) -> None:
     else:
         levels = (image.clamp(0, 1) * 255).round().byte()
         pixels = np.ascontiguousarray(levels.permute(1, 2, 0).numpy()[..., ::-1])
-    _, data = cv2.imencode(suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    with replacing(path.with_suffix(suffix)) as partial:
+    encode(path.with_suffix(suffix), pixels)
+
+
+def encode(path: Path, pixels: np.ndarray) -> None:
+    """Write pixels, as OpenCV orders them, as the kind of image that the path's suffix says; the file appears whole."""
+    _, data = cv2.imencode(path.suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    with replacing(path) as partial:
         partial.write_bytes(data.tobytes())

@@ -12,12 +12,10 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.atomic import replacing
-from torchpose.calibration import Calibration, read_calibration
+from torchpose.calibration import Calibration, read_calibration, write_calibration
 from torchpose.image_file import (
     DEPTH_UNIT,
     decode,
@@ -385,16 +383,7 @@ def write_recording(
         stack = getattr(backgrounds, field)
         for k, image in enumerate(stack if stack is not None else ()):
             write_image(folder / "background" / f"{field}_{k}", image, suffix)
-    calibration = {
-        "image_size": [camera.width, camera.height],
-        "focal_length": camera.focal_length,
-        "principal_point": [camera.cx, camera.cy],
-        **({"baseline": camera.baseline} if stereo else {"depth_unit": DEPTH_UNIT}),
-        "frame_rate": camera.frame_rate,
-        "rectified": True,
-    }
-    with replacing(folder / CALIBRATION) as partial:
-        partial.write_text(yaml.safe_dump(calibration, sort_keys=False), encoding="utf-8")
+    write_calibration(folder / CALIBRATION, Calibration(camera, depth_unit=None if stereo else DEPTH_UNIT))
     return folder
 
 
