@@ -87,8 +87,8 @@ class DisparitySpace:
         return (item * (self.height + 2) + row + 1) * self.columns + column + REACH
 
     def cell(self, pixel: Int[Tensor, "*n"], layer: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
-        row, column = pixel // self.columns, pixel % self.columns
-        return (row * self.layers + layer) * self.columns + column
+        # Of a row's cells come `layers` times as many before it; divisions are slow, and one will do.
+        return pixel + (pixel // self.columns * (self.layers - 1) + layer) * self.columns
 
     def layer(self, cell: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
         return cell // self.columns % self.layers
@@ -98,8 +98,7 @@ class DisparitySpace:
 
     def right_pixel(self, pixel: Int[Tensor, "*n"], layer: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
         """The right pixel that a left pixel means at a layer."""
-        row, column = pixel // self.columns, pixel % self.columns
-        return row * self.right_columns + column - layer + self.layers - 1
+        return pixel + pixel // self.columns * (self.layers - 1) - layer + self.layers - 1
 
     def steps(self, device: torch.device) -> Int[Tensor, "3 sets members"]:
         """What a step adds to a cell, to its left and to its right pixel; short sets repeat a member."""

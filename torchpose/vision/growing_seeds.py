@@ -168,8 +168,9 @@ def given_seeds(
     layer = (seeds - (space.least - 1)).round()
     known = (mask & (layer >= 1) & (layer <= space.disparities)).flatten().nonzero()[:, 0]
     reach = torch.arange(-config.seed_shift, config.seed_shift + 1, device=known.device)[:, None]
-    about = (layer.flatten()[known].long() + reach).clamp(1, space.disparities)  # (shifts, seeds)
-    near = space.cell(space.pixel(known).expand_as(about), about)
+    about = (layer.flatten().index_select(0, known).long() + reach).clamp(1, space.disparities)
+    ground = space.pixel(known)
+    near = space.cell(ground, torch.zeros_like(ground)) + about * space.columns  # (shifts, seeds)
     best, shift = volume.index_select(0, near.flatten()).view(near.shape).max(dim=0, keepdim=True)
     good = (best[0] >= config.tau).nonzero()[:, 0]
     cells = near.gather(0, shift)[0].index_select(0, good)
