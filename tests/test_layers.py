@@ -22,6 +22,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "growing_seeds",
         "semi_global",
         "stereo",
+        "empty_scene",
         "background",
         "scene_match",
         "silhouette",

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.vision.photometry import gradient_squared, noise_line, relative_gain, temporal_median
@@ -30,7 +30,6 @@ class BackgroundConfig:
     shadow_tint: float = 0.03  # relative change of colour in a shadow, lit by another part of the room
     unchanged_threshold: float = 2.5  # mean squared change of a 3 x 3 window from which it has changed
     shadow_threshold: float = 1.2  # mean squared misfit of a 5 x 5 window from which it is no shadow
-    max_frames: int = 15  # `from_recording` looks at that many frames
 
     def __post_init__(self) -> None:
         for name in ("noise_floor", "unchanged_threshold", "shadow_threshold"):
@@ -41,8 +40,6 @@ class BackgroundConfig:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
         if not 0 < self.shadow_min <= 1:
             raise ValueError(f"shadow_min must be in (0, 1], got {self.shadow_min}; 1 means no shadows")
-        if self.max_frames < 1:
-            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
 
 
 class BackgroundModel(nn.Module):
@@ -50,60 +47,64 @@ class BackgroundModel(nn.Module):
 
     A pixel is background if a 3 x 3 window that holds it has not changed, or if a 5 x 5 one is the empty
     scene's texture darkened by one factor: a cast shadow keeps colour and texture. Of the windows that hold a
-    pixel the best counts, so that the edge of a shadow or of the person does not widen.
+    pixel the best counts, so that the edge of a shadow or of the person does not widen. Pixels of which the scene is
+    never seen are unknown: their log-odds are 0, and windows leave them out.
     """
 
-    center: Float[Tensor, "3 height width"]  # the empty scene
+    center: Float[Tensor, "3 height width"]  # the empty scene, 0 where unknown
     variance: Float[Tensor, "3 height width"]  # of an unchanged pixel's difference from it
+    known: Bool[Tensor, "height width"]  # the scene was seen there
     _weight: Tensor
     _shadow_weight: Tensor
     _square_weight: Tensor
     _power: Tensor
+    _share: Tensor
+    _shadow_share: Tensor
 
     def __init__(self, frames: Frames, config: BackgroundConfig = BackgroundConfig()):
-        """Learn from K frames (K, 3, H, W) of the empty scene; one will do, two measure the noise better."""
+        """Learn from K frames (K, 3, H, W) of the empty scene; one will do, two measure the noise better.
+
+        NaN where somebody hides the scene, as `learn_empty_scene` marks it in the frames of a recording.
+        """
         super().__init__()
         if frames.shape[0] == 0:
-            raise ValueError("the background needs at least 1 frame, got 0; use `from_recording`")
-        if not bool(torch.isfinite(frames).all()) or frames.min() < 0 or frames.max() > 1:
-            raise ValueError("background frames must be finite and in [0, 1]; divide 8-bit images by 255")
+            raise ValueError("the background needs at least 1 frame, got 0; use `learn_empty_scene`")
+        if (frames < 0).any() or (frames > 1).any():
+            raise ValueError("background frames must be in [0, 1]; divide 8-bit images by 255")
         self.config = config
-        count = frames.shape[0]
         center = temporal_median(frames)
         frames = frames / relative_gain(frames, center)
         center = temporal_median(frames)
+        known = center.isfinite().all(0)
+        if not known.any():
+            raise ValueError(
+                "background frames must show the scene somewhere, got NaN alone; add empty frames"
+            )
+        count = frames.isfinite().all(1).sum(0).clamp_min(1)  # (H, W)
         noise = noise_line(frames)
         level = (noise[0] + noise[1] * center).clamp_min(config.noise_floor**2)
-        if count >= 5:  # enough to see a pixel flicker: a screen, a leaf, or a person who stood there
-            spread = window_mean((1.4826 * (frames - center).abs().median(0).values).square(), 1)
+        if len(frames) >= 5:  # enough to see a pixel flicker: a screen, a leaf, or a person who stood there
+            spread = (1.4826 * (frames - center).abs().nanmedian(0).values).square().nan_to_num(0)
+            spread = torch.where(count >= 5, window_mean(spread, 1), 0)
             level = level + (spread - 4 * level).clamp_min(0)
-        edges = gradient_squared(center)
+        edges = gradient_squared(center).nan_to_num(0)  # beside unknown pixels there is none
         variance = (
             level * (1 + 1 / count) + config.jitter**2 * edges + (config.gain_tolerance * center).square()
         )
         tinted = variance + (config.shadow_tint * center).square()
+        center, variance = torch.where(known, center, 0), torch.where(known, variance, torch.inf)
+        tinted = torch.where(known, tinted, torch.inf)  # so that unknown pixels weigh nothing
+        shares = [window_mean(known.to(center.dtype), radius).clamp_min(1e-6) for radius in (1, 2)]
         self.register_buffer("center", center, persistent=False)
         self.register_buffer("variance", variance, persistent=False)
+        self.register_buffer("known", known, persistent=False)
         self.register_buffer("_weight", 1 / (3 * variance), persistent=False)
         self.register_buffer("_shadow_weight", center / (3 * tinted), persistent=False)
         self.register_buffer("_square_weight", 1 / (3 * tinted), persistent=False)
-        self.register_buffer(
-            "_power",
-            window_mean((center.square() / (3 * tinted)).sum(0), 2).clamp_min(1e-12),
-            persistent=False,
-        )
-
-    @classmethod
-    def from_recording(
-        cls, frames: Frames, config: BackgroundConfig = BackgroundConfig()
-    ) -> "BackgroundModel":
-        """Learn from a recording (T, 3, H, W) with people in it: the median over evenly spread frames.
-
-        Right where the background is seen in more than half of them; who stayed longer is taken for it.
-        """
-        count = min(len(frames), config.max_frames)
-        picked = torch.linspace(0, max(len(frames) - 1, 0), count, device=frames.device).round().long()
-        return cls(frames[picked], config)
+        power = window_mean((center.square() / (3 * tinted)).sum(0), 2).clamp_min(1e-12)
+        self.register_buffer("_power", power, persistent=False)
+        self.register_buffer("_share", shares[0], persistent=False)
+        self.register_buffer("_shadow_share", shares[1], persistent=False)
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:
         """Log-odds in [-6, 4]: about -6 unchanged, -2 darkened like a shadow, 4 something else.
@@ -118,7 +119,7 @@ class BackgroundModel(nn.Module):
             )
         images = images / relative_gain(images, self.center)
         change = (self._weight * (images - self.center).square()).sum(1)  # 1 on average if unchanged
-        unchanged = window_min(window_mean(change, 1), 1)
+        unchanged = window_min(window_mean(change, 1) / self._share, 1)
         log_unchanged = (4 * (unchanged - self.config.unchanged_threshold)).clamp(-6, 4)
         shaded = window_min(self._shadow_misfit(images), 2)
         log_shaded = (3 * (shaded - self.config.shadow_threshold)).clamp(-2, 4)
@@ -126,14 +127,15 @@ class BackgroundModel(nn.Module):
         # A pixel on the person's edge mixes both and belongs to the side that gave it more than half: beside
         # unchanged pixels, its change must be half of the strongest near by (a quarter of the square).
         mixed = (change < 0.25 * window_max(change, 1)) & (window_min(log_unchanged, 1) < 0)
-        return torch.where(mixed & (log_unchanged > 0), log_odds.clamp_max(-4), log_odds)
+        log_odds = torch.where(mixed & (log_unchanged > 0), log_odds.clamp_max(-4), log_odds)
+        return torch.where(self.known, log_odds, 0)
 
     def _shadow_misfit(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:
         """Mean over 5 x 5 windows of (image - s center)^2 / variance, at the best s in [shadow_min, 1]."""
         product = window_mean((self._shadow_weight * images).sum(1), 2)
         square = window_mean((self._square_weight * images.square()).sum(1), 2)
         scale = (product / self._power).clamp(self.config.shadow_min, 1)
-        return square - 2 * scale * product + scale.square() * self._power
+        return (square - 2 * scale * product + scale.square() * self._power) / self._shadow_share
 
 
 @dataclass(frozen=True)

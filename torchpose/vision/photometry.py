@@ -1,6 +1,6 @@
 """Brightness of a camera: the gain between two pictures of a scene, and the noise level at each intensity.
 
-Images are RGB in [0, 1].
+Images are RGB in [0, 1], NaN where a picture does not show the scene.
 """
 
 import math
@@ -25,8 +25,8 @@ def relative_gain(
     counts, if neither black nor glaring; 1 where fewer than 5 % of them have a ratio of 0.55 to 1.8.
     """
     images, reference = images[..., ::4, ::4].flatten(2), reference[..., ::4, ::4].flatten(1)
-    usable = (reference > 0.05) & (reference < 0.95) & (images > 0.02) & (images < 0.98)
-    ratio = torch.log(images.clamp_min(0.02) / reference.clamp_min(0.02))  # (B, 3, n)
+    usable = (reference > 0.05) & (reference < 0.95) & (images > 0.02) & (images < 0.98)  # False for NaN
+    ratio = torch.log(images.clamp_min(0.02) / reference.clamp_min(0.02)).nan_to_num(0)  # (B, 3, n)
     usable = usable & (ratio.abs() < GAIN_RANGE)
     bins = round(2 * GAIN_RANGE / GAIN_STEP)
     index = ((ratio + GAIN_RANGE) / GAIN_STEP).long().clamp(0, bins - 1)
@@ -59,6 +59,8 @@ def noise_line(frames: Float[Tensor, "frames 3 height width"]) -> Float[Tensor, 
         level = F.avg_pool2d(frames[..., 1:-1], block).flatten()
         square = F.avg_pool2d(second, block).flatten()
         share, correction = 0.2, 1.0
+    shown = square.isfinite() & level.isfinite()
+    square, level = square[shown], level[shown]
     bins = (level * NOISE_BINS).long().clamp(0, NOISE_BINS - 1)
     rows = []
     for index in range(NOISE_BINS):
@@ -81,9 +83,16 @@ def noise_line(frames: Float[Tensor, "frames 3 height width"]) -> Float[Tensor, 
 
 
 def temporal_median(frames: Float[Tensor, "frames 3 height width"]) -> Float[Tensor, "3 height width"]:
-    """Median over frames, the mean of the middle two where their number is even."""
-    ordered = frames.sort(0).values
-    return 0.5 * (ordered[(len(frames) - 1) // 2] + ordered[len(frames) // 2])
+    """Median over the frames that are not NaN, the mean of the middle two where their number is even.
+
+    NaN where all are.
+    """
+    ordered = frames.sort(0).values  # NaN last
+    if not ordered[-1].isnan().any():
+        return 0.5 * (ordered[(len(frames) - 1) // 2] + ordered[len(frames) // 2])
+    count = frames.isfinite().sum(0, keepdim=True)
+    middle = [ordered.gather(0, index)[0] for index in ((count - 1).clamp_min(0) // 2, count // 2)]
+    return torch.where(count[0] > 0, 0.5 * (middle[0] + middle[1]), torch.nan)
 
 
 def gradient_squared(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:

@@ -1,0 +1,257 @@
+"""The empty scene out of a stereo recording with people in it: where they stand in each frame, and what is behind.
+
+What moves in front of the scene is a person for sure. A person's still parts hang together with the moving ones, at the
+same depth, and stand out of the planes of the room (floor and walls). The rest of each frame shows the scene; where no
+frame does, it stays unknown. Left-camera frame, metres; disparity in px, NaN where unknown.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchpose.vision.camera import StereoCamera
+from torchpose.vision.disparity import StereoMatcher
+from torchpose.vision.photometry import temporal_median
+from torchpose.vision.windows import window_max, window_min
+
+Frames = Float[Tensor, "frames 3 height width"]
+Plane = Float[Tensor, "height width"]
+Planes = Float[Tensor, "frames height width"]
+Masks = Bool[Tensor, "frames height width"]
+
+
+@dataclass(frozen=True)
+class EmptySceneConfig:
+    """Settings of `learn_empty_scene`. Disparities (px) are those of the shrunken images."""
+
+    shrink: int = 2  # by which images are made smaller to find the people
+    far_share: float = 0.2  # of the frames; the disparity that so many do not exceed is the farthest seen
+    step: float = 1.0  # px, by which a pixel is nearer than that where somebody has moved
+    plane_noise: float = 0.6  # px, to either side of a plane of the room
+    least_plane: float = 0.2  # share of the image that a plane takes at least
+    gap: float = 1.5  # px, disparity step at which things do not hang together
+    reach: float = 0.6  # m, of a person before and behind the middle
+    least_moved: int = 50  # px, fewer are noise
+    least_seen: int = 3  # frames that show the scene behind a pixel, or it is unknown
+    fattening: int = 4  # px of the full images, by which disparity next to what is unseen is not trusted
+    margin: int = 1  # px, added around people: the disparity of edges is fattened
+    smallest: float = 0.8  # m, height of a person where nobody moves
+    tallest: float = 2.3  # m
+
+    def __post_init__(self) -> None:
+        if self.shrink < 1 or self.least_moved < 1 or self.margin < 0:
+            values = f"{self.shrink}, {self.least_moved} and {self.margin}"
+            raise ValueError(f"shrink and least_moved must be at least 1 and margin 0, got {values}")
+        if not (0 <= self.far_share < 1 and 0 < self.least_plane < 1):
+            raise ValueError(
+                f"far_share and least_plane must be shares, got {self.far_share} and {self.least_plane}"
+            )
+        for name in ("step", "plane_noise", "gap", "reach"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class EmptyScene:
+    """What a recording shows of the scene behind its people."""
+
+    left: Frames  # NaN where somebody hides the scene
+    right: Frames
+    disparity: Plane  # px; what nobody ever sees is continued from the farther side of the row
+    seen: Bool[Tensor, "height width"]  # by one frame at least; elsewhere `disparity` is a guess
+
+
+def learn_empty_scene(
+    left: Frames,
+    right: Frames,
+    matcher: StereoMatcher,
+    camera: StereoCamera,
+    disparity_range: tuple[int, int],
+    config: EmptySceneConfig = EmptySceneConfig(),
+) -> EmptyScene:
+    """The scene behind the people of a few frames (T, 3, H, W) spread over a recording, RGB in [0, 1].
+
+    Where nobody moves, the tallest thing of a person's height that stands out of the room is taken for a person, with
+    a warning.
+    """
+    size = (left.shape[2] // config.shrink, left.shape[3] // config.shrink)
+    least, greatest = disparity_range[0] // config.shrink, -(-disparity_range[1] // config.shrink)
+    found = []
+    for images in zip(left, right, strict=True):  # one by one: a batch's volume of all disparities is large
+        small = [F.interpolate(image[None], size, mode="area") for image in images]
+        found.append(matcher(small[0], small[1], disparity_range=(least, greatest)).values)
+    disparity = torch.cat(found)
+    people = find_people(disparity, camera.scaled(1 / config.shrink), config)
+    hidden = [_enlarge(mask, left) for mask in (people, _in_right_image(people, disparity))]
+    shown = [
+        torch.where(h[:, None], torch.nan, images) for h, images in zip(hidden, (left, right), strict=True)
+    ]
+    # Where few frames show the scene, it may be that somebody was not found in them.
+    enough = min(config.least_seen, len(left))
+    often = [images.isfinite().all(1).sum(0) >= enough for images in shown]
+    shown = [torch.where(o, images, torch.nan) for o, images in zip(often, shown, strict=True)]
+    empty, whole = ([temporal_median(images) for images in two] for two in (shown, (left, right)))
+    seen = often[0]
+    # The people who stay unseen through are matched with themselves, and then left out.
+    pair = [torch.where(a.isnan(), b, a)[None] for a, b in zip(empty, whole, strict=True)]
+    scene = matcher(pair[0], pair[1], disparity_range=disparity_range).values[0]
+    trusted = window_min(seen.to(scene.dtype), config.fattening) > 0
+    return EmptyScene(shown[0], shown[1], continue_rows(scene, trusted), seen)
+
+
+def find_people(
+    disparity: Planes, camera: StereoCamera, config: EmptySceneConfig = EmptySceneConfig()
+) -> Masks:
+    """Where people stand in each frame of a still camera, from the frames' disparities (T, H, W).
+
+    Warns where nobody moves.
+    """
+    far = disparity.nanquantile(config.far_share, dim=0)
+    room = torch.zeros_like(disparity, dtype=torch.bool)
+    for plane in room_planes(far, config):
+        room |= (disparity - plane).abs() < config.plane_noise
+    standing = disparity.isfinite() & ~room
+    moved = window_min((standing & (disparity > far + config.step)).to(disparity.dtype), 1) > 0
+    # A step between a pixel and its neighbours cuts what hangs together.
+    nearest = window_max(disparity.nan_to_num(-torch.inf), 1)
+    farthest = window_min(torch.where(disparity.isnan(), torch.inf, disparity), 1)
+    pieces = standing & ~(nearest - farthest > config.gap)
+    moving = moved.flatten(1).sum(1) >= config.least_moved
+    if not moving.any():
+        warnings.warn(
+            "nobody moves in this recording, so its empty scene is a guess that may hold the person; "
+            "record a frame or two of the empty scene into its folder background/",
+            stacklevel=2,
+        )
+        return _rim(
+            torch.stack([_tallest(p, d, camera, config) for p, d in zip(pieces, disparity, strict=True)]),
+            standing,
+            config,
+        )
+    depth = camera.depth(disparity)
+    people = torch.zeros_like(moved)
+    # Whoever rests in one frame moves in another: in the second round, whatever stands where a person was
+    # found, at that person's disparity, is a seed too.
+    for _ in range(2):
+        found = torch.where(people, disparity, torch.nan).nanmedian(0).values
+        resting = (disparity - found).abs() < config.plane_noise
+        rows = []
+        for index in range(len(disparity)):
+            seeds = (moved[index] | resting[index]) & standing[index]
+            measured = depth[index][moved[index] if moving[index] else seeds]
+            near = (depth[index] - measured.nanmedian()).abs() < config.reach
+            rows.append(_pieces_with(pieces[index] & near, seeds, config.least_moved // 2))
+        people = torch.stack(rows)
+    return _rim(people, standing, config)
+
+
+def room_planes(disparity: Plane, config: EmptySceneConfig = EmptySceneConfig()) -> list[Plane]:
+    """Disparities (H, W) of the planes that fill a share of the image: a plane of the room is one in disparity too.
+
+    By RANSAC on 4000 pixels, plane after plane, the largest first; the random numbers are always the same.
+    """
+    height, width = disparity.shape
+    generator = torch.Generator().manual_seed(0)
+    v, u = (disparity.isfinite()).nonzero().unbind(1)
+    if len(u) < 3:
+        return []
+    chosen = torch.randperm(len(u), generator=generator)[:4000].to(u.device)
+    u, v = u[chosen], v[chosen]
+    points = torch.stack([u, v, torch.ones_like(u)], 1).to(disparity.dtype)
+    values = disparity[v, u]
+    grid = torch.stack(
+        [
+            torch.arange(width, device=u.device).expand(height, -1),
+            torch.arange(height, device=u.device)[:, None].expand(-1, width),
+            torch.ones(height, width, device=u.device),
+        ],
+        -1,
+    ).to(disparity.dtype)
+    least, tolerance, planes = config.least_plane * len(points), 0.5 * config.plane_noise, []
+    while len(points) > least:
+        corners = torch.randint(len(points), (500, 3), generator=generator).to(u.device)
+        triangle = points[corners]
+        wide = torch.linalg.det(triangle).abs() > 1e-3 * height * width  # twice its area: not on one line
+        if not wide.any():
+            break
+        candidates = torch.linalg.solve(triangle[wide], values[corners[wide]][..., None])[..., 0]
+        inside = (points @ candidates.T - values[:, None]).abs() < tolerance
+        best = candidates[inside.sum(0).argmax()]
+        for _ in range(2):
+            inside = (points @ best - values).abs() < tolerance
+            best = torch.linalg.lstsq(points[inside], values[inside][:, None]).solution[:, 0]
+        inside = (points @ best - values).abs() < tolerance
+        if inside.sum() < least:
+            break
+        planes.append(grid @ best)
+        points, values = points[~inside], values[~inside]
+    return planes
+
+
+def continue_rows(disparity: Plane, seen: Bool[Tensor, "height width"]) -> Plane:
+    """The disparity, where not `seen` that of the nearest seen pixel of the row, of two the farther; else NaN."""
+    columns = torch.arange(disparity.shape[1], device=disparity.device).expand_as(disparity)
+    known = seen & disparity.isfinite()
+    before = torch.where(known, columns, -1).cummax(1).values
+    after = torch.where(known, columns, disparity.shape[1]).flip(1).cummin(1).values.flip(1)
+    sides = []
+    for index, there in ((before, before >= 0), (after, after < disparity.shape[1])):
+        side = disparity.gather(1, index.clamp(0, disparity.shape[1] - 1))
+        sides.append(torch.where(there, side, torch.inf))
+    farther = torch.minimum(sides[0], sides[1])
+    return torch.where(seen, disparity, torch.where(farther.isfinite(), farther, torch.nan))
+
+
+def _pieces_with(
+    pieces: Bool[Tensor, "height width"], seeds: Bool[Tensor, "height width"], least: int
+) -> Bool[Tensor, "height width"]:
+    """The connected pieces that hold `least` seeds."""
+    count, labels = cv2.connectedComponents(pieces.cpu().numpy().astype(np.uint8), connectivity=8)
+    held = np.bincount(labels[seeds.cpu().numpy()], minlength=count) >= least
+    held[0] = False
+    return torch.from_numpy(held[labels]).to(pieces.device)
+
+
+def _tallest(
+    pieces: Bool[Tensor, "height width"], disparity: Plane, camera: StereoCamera, config: EmptySceneConfig
+) -> Bool[Tensor, "height width"]:
+    """The connected piece that is the tallest within a person's height, if there is any."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        pieces.cpu().numpy().astype(np.uint8), connectivity=8
+    )
+    depth, best, person = camera.depth(disparity).cpu().numpy(), config.smallest, 0
+    for index in range(1, count):
+        if stats[index, cv2.CC_STAT_AREA] < config.least_moved:
+            continue
+        rows = stats[index, cv2.CC_STAT_HEIGHT]
+        height = float(rows * np.median(depth[labels == index]) / camera.focal_length)
+        if best < height < config.tallest:
+            best, person = height, index
+    return torch.from_numpy((labels == person) & (person > 0)).to(pieces.device)
+
+
+def _rim(people: Masks, standing: Masks, config: EmptySceneConfig) -> Masks:
+    """The people with what the cuts took from their rims, and a margin around."""
+    whole = standing & (window_max(people.to(torch.float32), 2) > 0)
+    return window_max((people | whole).to(torch.float32), config.margin) > 0
+
+
+def _in_right_image(people: Masks, disparity: Planes) -> Masks:
+    """The same people in the right images: each pixel moved by its disparity, or the middle one of the person."""
+    inside = torch.where(people, disparity, torch.nan)
+    middle = inside.flatten(1).nanmedian(1).values.nan_to_num(0)[:, None, None]
+    shift = torch.where(inside.isnan(), middle, inside).round().long()
+    columns = (torch.arange(people.shape[2], device=people.device) - shift).clamp(0, people.shape[2] - 1)
+    moved = torch.zeros_like(disparity).scatter_reduce(2, columns, people.to(disparity.dtype), "amax")
+    return window_max(moved, 1) > 0
+
+
+def _enlarge(masks: Masks, images: Frames) -> Bool[Tensor, "frames h w"]:
+    size = (images.shape[2], images.shape[3])
+    return F.interpolate(masks[:, None].to(images.dtype), size, mode="nearest")[:, 0] > 0
