@@ -98,6 +98,25 @@ def test_intrinsics_follow_the_size_of_the_images(tmp_path: Path, size: tuple[in
     assert (raw.camera.width, raw.camera.height) == size
 
 
+@pytest.mark.parametrize("videos", [1, 2])
+def test_videos_of_another_size_open_with_the_scaled_calibration_at_their_own_rate(
+    tmp_path: Path, videos: int
+):
+    """One side-by-side video, or two, of half the calibration's size."""
+    size, paths = (SIZE[0] // 2 * (3 - videos), SIZE[1] // 2), []
+    for k in range(videos):
+        paths.append(tmp_path / f"{k}.avi")
+        writer = cv2.VideoWriter(str(paths[k]), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 12.5, size)
+        for level in range(3):
+            writer.write(np.full((size[1], size[0], 3), 40 * level, np.uint8))
+        writer.release()
+    recording = open_recording(*paths, calibration=save(tmp_path, calibration({1: 2, 2: -1})))
+    camera = recording.camera
+    assert (camera.width, camera.height, camera.frame_rate) == (SIZE[0] // 2, SIZE[1] // 2, 12.5)
+    assert recording[1].left.shape == recording[1].right.shape == (3, SIZE[1] // 2, SIZE[0] // 2)
+    assert recording[2].time_s == 2 / 12.5
+
+
 def test_other_sockets_and_a_frame_rate_of_its_own(tmp_path: Path):
     values = calibration({0: 2, 2: -1})
     values |= {"stereoRectificationData": {"leftCameraSocket": 2, "rightCameraSocket": 0}, "frame_rate": 12}
