@@ -38,7 +38,6 @@ class EmptySceneConfig:
     gap: float = 1.5  # px, disparity step at which things do not hang together
     reach: float = 0.6  # m, of a person before and behind the middle
     least_moved: int = 50  # px, fewer are noise
-    least_seen: int = 3  # frames that show the scene behind a pixel, or it is unknown
     fattening: int = 4  # px of the full images, by which disparity next to what is unseen is not trusted
     margin: int = 1  # px, added around people: the disparity of edges is fattened
     smallest: float = 0.8  # m, height of a person where nobody moves
@@ -92,12 +91,8 @@ def learn_empty_scene(
     shown = [
         torch.where(h[:, None], torch.nan, images) for h, images in zip(hidden, (left, right), strict=True)
     ]
-    # Where few frames show the scene, it may be that somebody was not found in them.
-    enough = min(config.least_seen, len(left))
-    often = [images.isfinite().all(1).sum(0) >= enough for images in shown]
-    shown = [torch.where(o, images, torch.nan) for o, images in zip(often, shown, strict=True)]
     empty, whole = ([temporal_median(images) for images in two] for two in (shown, (left, right)))
-    seen = often[0]
+    seen = empty[0].isfinite().all(0)
     # The people who stay unseen through are matched with themselves, and then left out.
     pair = [torch.where(a.isnan(), b, a)[None] for a, b in zip(empty, whole, strict=True)]
     scene = matcher(pair[0], pair[1], disparity_range=disparity_range).values[0]

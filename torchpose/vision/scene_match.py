@@ -57,11 +57,11 @@ class SceneMatch(nn.Module):
     def __init__(
         self,
         left: Float[Tensor, "height width"],
-        right: Float[Tensor, "height width"],
-        disparity: Float[Tensor, "height width"],
+        right: Float[Tensor, "right_height right_width"],
+        disparity: Float[Tensor, "scene_height scene_width"],
         config: SceneMatchConfig = SceneMatchConfig(),
     ):
-        """Learn from one grey pair of the empty scene, or its median, and its disparity."""
+        """Learn from one grey pair of the empty scene, or its median, and its disparity; NaN where unknown."""
         super().__init__()
         if not left.shape == right.shape == disparity.shape:
             shapes = f"{tuple(left.shape)}, {tuple(right.shape)} and {tuple(disparity.shape)}"

@@ -53,7 +53,7 @@ class SilhouetteConfig:
     sweeps: int = 5  # of the mean field; 0 leaves each pixel alone
     bridge: int = 2  # px, parts apart by up to twice this belong together
     max_hole: float = 0.002  # share of the person; larger holes stay if the background is seen through them:
-    see_through: float = -2.0  # if the mean of their log-odds is less
+    see_through: float = -2.2  # if the mean of their log-odds is less; a shadow's colour alone is no proof
     min_area: float = 0.008  # share of the image below which there is no person
 
     def __post_init__(self) -> None:
