@@ -169,7 +169,7 @@ def test_pixels_of_which_the_scene_is_never_seen_say_nothing():
     model, whole = BackgroundModel(shown), BackgroundModel(frames)
     image = picture(torch.where(person, 0.9, wall))[None]
     log_odds = model(image)[0]
-    assert (log_odds[hidden] == 0).all()
+    assert (log_odds[hidden] == BackgroundConfig().unknown).all()
     assert torch.equal(model.known, ~hidden)
     apart = ~dilation_of(hidden, 6)
     assert ((log_odds - whole(image)[0])[apart].abs() < 0.5).float().mean() > 0.98

@@ -27,9 +27,13 @@ class BackgroundConfig:
     gain_tolerance: float = 0.01  # relative brightness error left after the gain of a frame is taken out
     jitter: float = 0.15  # px, tremor of the camera: matters at edges of the background
     shadow_min: float = 0.4  # a cast shadow leaves at least this share of the light
+    glare: float = 0.98  # intensity from which the sensor may be saturated
     shadow_tint: float = 0.03  # relative change of colour in a shadow, lit by another part of the room
     unchanged_threshold: float = 2.5  # mean squared change of a 3 x 3 window from which it has changed
     shadow_threshold: float = 1.2  # mean squared misfit of a 5 x 5 window from which it is no shadow
+    unknown: float = (
+        -1.0
+    )  # log-odds where the scene was never seen: also around whoever hides it all the time
 
     def __post_init__(self) -> None:
         for name in ("noise_floor", "unchanged_threshold", "shadow_threshold"):
@@ -48,7 +52,7 @@ class BackgroundModel(nn.Module):
     A pixel is background if a 3 x 3 window that holds it has not changed, or if a 5 x 5 one is the empty
     scene's texture darkened by one factor: a cast shadow keeps colour and texture. Of the windows that hold a
     pixel the best counts, so that the edge of a shadow or of the person does not widen. Pixels of which the scene is
-    never seen are unknown: their log-odds are 0, and windows leave them out.
+    never seen are unknown: their log-odds are `unknown`, and windows leave them out.
     """
 
     center: Float[Tensor, "3 height width"]  # the empty scene, 0 where unknown
@@ -128,7 +132,10 @@ class BackgroundModel(nn.Module):
         # unchanged pixels, its change must be half of the strongest near by (a quarter of the square).
         mixed = (change < 0.25 * window_max(change, 1)) & (window_min(log_unchanged, 1) < 0)
         log_odds = torch.where(mixed & (log_unchanged > 0), log_odds.clamp_max(-4), log_odds)
-        return torch.where(self.known, log_odds, 0)
+        # Of a pixel that glares, any shade may be a shadow, and anything bright may hide.
+        glaring = (self.center >= self.config.glare).all(0)
+        log_odds = torch.where(glaring, log_odds.clamp(-2, 0.5), log_odds)
+        return torch.where(self.known, log_odds, self.config.unknown)
 
     def _shadow_misfit(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:
         """Mean over 5 x 5 windows of (image - s center)^2 / variance, at the best s in [shadow_min, 1]."""
