@@ -41,6 +41,7 @@ from torchpose.vision.background import (
     far_readings,
 )
 from torchpose.vision.camera import StereoCamera
+from torchpose.vision.disparity import bridge_gaps
 from torchpose.vision.empty_scene import EmptySceneConfig, learn_empty_scene
 from torchpose.vision.faces import FaceConfig, FaceDetector, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds
@@ -211,6 +212,7 @@ class Eyes(nn.Module):
                     left, right, self.stereo, self.camera, (0, self.disparity_range[1]), self.config.empty_scene
                 )
             left, right, disparity = scene.left, scene.right, scene.disparity
+        disparity = bridge_gaps(disparity)  # a bare wall and a glaring floor match nowhere but at their rims
         self.background = BackgroundModel(left, self.config.background)
         self.background_depth = self.camera.depth(disparity)
         empty = rgb_to_grayscale(torch.stack([temporal_median(left), temporal_median(right)]))[:, 0]
@@ -349,6 +351,7 @@ class StereoToPose(nn.Module):
         """Learn the recording's empty scene and the person's size, and forget any other person."""
         self.learn_background(recording)
         self.tracker.forget()
+        self.eyes.last = None
         frames = _readable(recording, _spread(len(recording), self.config.size_frames))
         # These frames come again in their turn; what was seen of them is kept until then.
         self._seen = {frame.index: self.eyes(frame, self.device) for frame in frames}

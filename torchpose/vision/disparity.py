@@ -102,6 +102,29 @@ def smooth(disparity: Grey, radius: int) -> Grey:
     return disparity + total / count
 
 
+def bridge_gaps(disparity: Float[Tensor, "height width"], step: float = 1.0) -> Float[Tensor, "height width"]:
+    """Where a scene's disparity (px) is unknown, a straight line between its neighbours, if they are of one surface.
+
+    The nearest known pixels to either side of a row, and of a column, belong together if they differ by at most
+    `step` px; a pixel between two such pairs takes the mean of both lines. Other gaps stay NaN: depth may end there.
+    """
+    lines = torch.stack([_bridged(disparity, step), _bridged(disparity.t(), step).t()])
+    return disparity.where(~disparity.isnan(), lines.nanmean(0))
+
+
+def _bridged(disparity: Float[Tensor, "lines size"], step: float) -> Float[Tensor, "lines size"]:
+    """The lines between the known pixels of each row; NaN where none spans the pixel."""
+    size = disparity.shape[1]
+    place = torch.arange(size, device=disparity.device).expand_as(disparity)
+    known = ~disparity.isnan()
+    before = place.where(known, -1).cummax(1).values
+    after = place.where(known, size).flip(1).cummin(1).values.flip(1)
+    first, last = disparity.gather(1, before.clamp_min(0)), disparity.gather(1, after.clamp_max(size - 1))
+    share = (place - before) / (after - before).clamp_min(1)
+    joined = (before >= 0) & (after < size) & ((first - last).abs() <= step)
+    return torch.lerp(first, last, share.to(disparity)).where(joined, torch.nan)
+
+
 def _check_sizes(left: Tensor, right: Tensor, mask: Tensor | None, seeds: Tensor | None) -> None:
     if left.shape != right.shape:
         raise ValueError(
