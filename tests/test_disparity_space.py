@@ -30,6 +30,15 @@ def test_similarities_are_their_definition() -> None:
     assert (volume[..., [0, 1, -2, -1]] == -1).all()
 
 
+def test_similarities_end_where_the_right_image_ends() -> None:
+    left, right = torch.rand(2, 1, 9, 12, dtype=torch.float64)
+    mask = torch.ones(1, 9, 12, dtype=torch.bool)
+    space = DisparitySpace.around(mask, -4, 6)
+    volume = similarities(left, right, mask, space, (5,), 0.01).view(11, 13, 16)[1:-1, 1:-1, 2:-2]
+    column = torch.arange(12) - torch.arange(-4, 7)[:, None]
+    assert torch.equal(volume != 0, ((column >= 0) & (column < 12)).expand_as(volume))
+
+
 @pytest.mark.parametrize("window", [3, 5, 7, 9, 13])
 def test_box_sums_are_pooling(window: int) -> None:
     image = torch.rand(2, 20, 31, dtype=torch.float64)

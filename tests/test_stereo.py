@@ -227,6 +227,10 @@ def test_negative_disparities_are_ordinary(kind: MatcherKind) -> None:
     assert error.median() < 0.05
     assert (error > 0.5).double().mean() < 0.02  # where the window meets the image's edge
     assert values[:, 70:].isnan().all()
+    mask = torch.zeros(1, 40, 80, dtype=torch.bool)
+    mask[0, :, 8:30] = True  # what it matches lies beside it
+    values = matcher(kind)(right, left, mask, disparity_range=(-20, -10)).values[0]
+    assert values[3:-3, 8:30].isfinite().double().mean() > 0.98
 
 
 @every_kind
@@ -360,17 +364,26 @@ def test_a_configuration_names_its_matcher_and_gives_it_its_settings() -> None:
 
 
 def test_opencvs_matcher_is_opencvs() -> None:
+    """On a pair so noisy that every setting matters."""
     left, right, _ = sphere()
-    config = OpenCVConfig(
-        block_size=7, uniqueness_ratio=5, speckle_window=30, speckle_range=1, left_right=2, smoothing=0
-    )
-    found = OpenCVMatcher(config)(left, right, disparity_range=(2, 25))
-    grey = eight_bits(left), eight_bits(right)
+    left, right = (rgb((side + 0.2 * torch.randn_like(side))[0, 0].clamp(0, 1)) for side in (left, right))
+    settings = {
+        "block_size": 7,
+        "uniqueness_ratio": 5,
+        "speckle_window": 30,
+        "speckle_range": 1,
+        "left_right": 2,
+    }
+    found = OpenCVMatcher(OpenCVConfig(**settings, smoothing=0))(left, right, disparity_range=(2, 25))
     theirs = cv2.StereoSGBM.create(2, 32, 7, 8 * 49, 32 * 49, 2, 0, 5, 30, 1, cv2.STEREO_SGBM_MODE_SGBM_3WAY)
-    expected = theirs.compute(*grey) / 16
+    expected = theirs.compute(eight_bits(left), eight_bits(right)) / 16
     expected = torch.from_numpy(np.where((expected >= 2) & (expected <= 25), expected, np.nan))
     assert_close(found.values[0], expected, equal_nan=True)
     assert torch.equal(found.confidence[0], expected.isfinite().double())
+    for name, value in settings.items():
+        other = OpenCVMatcher(OpenCVConfig(**settings | {name: 3 * value}, smoothing=0))
+        values = other(left, right, disparity_range=(2, 25)).values[0]
+        assert not values.nan_to_num(-1).equal(expected.nan_to_num(-1)), name
 
 
 def eight_bits(image: Tensor) -> np.ndarray:
