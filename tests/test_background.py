@@ -84,6 +84,23 @@ def test_a_darker_and_a_coloured_shadow_is_none():
     assert (log_odds[hair | arm] > 0).float().mean() > 0.97
 
 
+def test_a_glaring_floor_leaves_it_to_depth():
+    """A shadow on what saturates the sensor has any shade, and a white shirt before it has none: only depth tells."""
+    _, empty = room(count=2)
+    floor, shadow, shirt = rectangle(60, 0, 60, 160), rectangle(70, 20, 40, 40), rectangle(70, 100, 40, 30)
+    empty[:, :, floor] = 1.0
+    image = empty[:1].clone()
+    image[:, :, shadow] = 0.2
+    log_odds = BackgroundModel(empty)(image)
+    assert (log_odds[0, shadow] <= 0.5).all()
+    assert (log_odds[0, floor] >= -1).all()
+    assert (log_odds[0, :50] < -4).float().mean() > 0.95  # where nothing glares, nothing is different
+    scene = torch.full(SIZE, 3.0)
+    depth = torch.where(shirt, 2.4, scene)[None]
+    mask = person_silhouette(log_odds, depth, background_depth=scene).mask[0]
+    assert overlap(mask, shirt) > 0.85  # the coupling rounds the corners off
+
+
 def test_light_is_no_shadow():
     """A lamp's spot keeps texture and colour as a shadow does, but is brighter: somebody in a pale shirt."""
     wall, empty = room()

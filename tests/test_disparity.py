@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchpose.vision.disparity import smooth, without_islands
+from torchpose.vision.disparity import bridge_gaps, smooth, without_islands
 
 
 def random_disparity(*shape: int, spread: float = 3.0, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -104,3 +104,41 @@ def test_smoothing_keeps_steps_holes_and_float32() -> None:
     disparity = torch.tensor([[4.0, 4.4, 4.2, 9.0, torch.nan, 9.4]]).expand(1, 5, 6)
     expected = torch.tensor([[4.2, 4.2, 4.2, 9.2, torch.nan, 9.2]]).expand(1, 5, 6)
     assert_close(smooth(disparity, 2), expected, equal_nan=True)
+
+
+def bridged_by_numpy(disparity: np.ndarray, step: float) -> np.ndarray:
+    """NaN where neither the row nor the column has a known pixel of the same surface to either side."""
+    result = disparity.copy()
+    for y, x in np.argwhere(np.isnan(disparity)):
+        lines = []
+        for line, at in ((disparity[y], x), (disparity[:, x], y)):
+            known = np.flatnonzero(~np.isnan(line))
+            before, after = known[known < at], known[known > at]
+            if len(before) and len(after) and abs(line[before[-1]] - line[after[0]]) <= step:
+                lines.append(np.interp(at, known, line[known]))
+        if lines:
+            result[y, x] = np.mean(lines)
+    return result
+
+
+@pytest.mark.parametrize("step", [0.5, 2.0, 20.0])
+@pytest.mark.parametrize("unknown", [0.3, 0.8])
+def test_gaps_are_bridged_along_rows_and_columns(unknown: float, step: float) -> None:
+    rough = (5 + 2 * torch.randn(11, 17)).double()
+    gappy = rough.where(torch.rand(11, 17) >= unknown, torch.nan)
+    assert_close(
+        bridge_gaps(gappy, step), torch.from_numpy(bridged_by_numpy(gappy.numpy(), step)), equal_nan=True
+    )
+
+
+def test_a_plane_is_bridged_exactly_and_a_step_is_not() -> None:
+    y, x = torch.meshgrid(torch.arange(12.0), torch.arange(20.0), indexing="ij")
+    floor = 9 + 0.04 * x - 0.03 * y
+    hole = floor.clone()
+    hole[3:9, 5:14] = torch.nan
+    assert_close(bridge_gaps(hole), floor)
+    step = torch.where(x < 10, 4.0, 12.0)
+    step[:, 7:13] = torch.nan
+    assert_close(bridge_gaps(step), step, equal_nan=True)
+    nothing = torch.full((4, 6), torch.nan)
+    assert bridge_gaps(nothing).isnan().all()

@@ -206,7 +206,7 @@ def winner_by_loop(
         here = float(total[best, x])
         rest = [float(total[d, x]) for d in range(layers) if abs(d - best) > 1]
         second = min(rest, default=255.0)
-        margin[x] = max(0.0, second - here) / max(second, 1.0)
+        margin[x] = max(0.0, second - here) / (second + 24)
         if sure:
             shift = 0.0
             if 0 < best < layers - 1:
@@ -227,7 +227,7 @@ def test_the_winner_is_the_least_that_the_right_image_agrees_with(
     total = torch.randint(0, greatest + 1, (4, 2, layers, 15), dtype=torch.uint8)
     region = torch.rand(2, 4, 15) < 0.8
     for reach in ((3, 9), (-2, 20), (20, 14)):
-        found, margin = winners(total.clone(), region, reach, consistency)
+        found, margin = winners(total.clone(), region, reach, SemiGlobalConfig(consistency=consistency))
         for item, y in itertools.product(range(2), range(4)):
             sums, inside = total[y, item].numpy().astype(np.int64), region[item, y].numpy()
             layer, share = winner_by_loop(sums, inside, reach, consistency)
@@ -241,11 +241,13 @@ def test_a_hundred_and_twenty_eight_disparities_are_numbered() -> None:
     columns = torch.arange(200)
     chosen = (columns * 37) % 128
     total[0, 0, chosen, columns] = 251
-    found, margin = winners(total, torch.ones(1, 1, 200, dtype=torch.bool), (0, 199), 127)
+    found, margin = winners(
+        total, torch.ones(1, 1, 200, dtype=torch.bool), (0, 199), SemiGlobalConfig(consistency=127)
+    )
     seen = columns >= chosen
     assert_close(found[0, 0][seen], chosen[seen].float(), atol=0.5, rtol=0)
     assert found[0, 0][~seen].isnan().all()
-    assert_close(margin, torch.full_like(margin, 1 / 252))
+    assert_close(margin, torch.full_like(margin, 1 / (252 + 24)))
 
 
 def test_more_disparities_than_that_are_refused() -> None:

@@ -134,7 +134,7 @@ class BackgroundModel(nn.Module):
         log_odds = torch.where(mixed & (log_unchanged > 0), log_odds.clamp_max(-4), log_odds)
         # Of a pixel that glares, any shade may be a shadow, and anything bright may hide.
         glaring = (self.center >= self.config.glare).all(0)
-        log_odds = torch.where(glaring, log_odds.clamp(-2, 0.5), log_odds)
+        log_odds = torch.where(glaring, log_odds.clamp(-1, 0.5), log_odds)
         return torch.where(self.known, log_odds, self.config.unknown)
 
     def _shadow_misfit(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:

@@ -87,9 +87,10 @@ def smooth(disparity: Grey, radius: int) -> Grey:
         return disparity
     total, count = torch.zeros_like(disparity), torch.ones_like(disparity)
     height, width = disparity.shape[1:]
+    down, across = min(radius, height - 1), min(radius, width - 1)
     # Who is near whom goes both ways, so half of the square will do.
-    for row in range(radius + 1):
-        for column in range(-radius if row else 1, radius + 1):
+    for row in range(down + 1):
+        for column in range(-across if row else 1, across + 1):
             one = (slice(None), slice(row, None), slice(max(0, column), width + min(0, column)))
             other = (slice(None), slice(None, height - row), slice(max(0, -column), width - max(0, column)))
             difference = disparity[one] - disparity[other]

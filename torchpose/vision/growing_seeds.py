@@ -177,7 +177,7 @@ def given_seeds(
 
     silent = mask.flatten().index_fill(0, known.index_select(0, good), False).view(mask.shape)
     lattice = torch.zeros_like(mask)
-    lattice[:, ::2, ::2] = True
+    lattice[:, space.top % 2 :: 2, space.left % 2 :: 2] = True
     others = space.pixel((silent & lattice).flatten().nonzero()[:, 0])
     return torch.cat([cells, similar_cells(volume, others, space, config)])
 

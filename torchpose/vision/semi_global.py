@@ -79,7 +79,7 @@ class SemiGlobal(StereoMatcher):
 
     All sums fit into bytes, of which a processor adds 32 at a time. Pixels off the mask cost nothing at any
     disparity, so what lies there has no influence. The confidence is the margin to the best disparity more
-    than 1 px away, as a share of its sum. Seeds do not help this method: narrow the range instead. The memory
+    than 1 px away, as a share of its sum (and of one census, lest sums near 0 should count). Seeds do not help this method: narrow the range instead. The memory
     is 4 bytes a cell over the masks' bounding box: 80 MB for 640 x 480 with 64 disparities.
     """
 
@@ -106,10 +106,10 @@ class SemiGlobal(StereoMatcher):
         values, confidence = torch.full_like(left, torch.nan), torch.zeros_like(left)
         region = mask[:, rows, columns]
         cost = matching_cost(left, right, region, rows, columns, least, greatest, self.config.radius)
-        total = aggregate(cost, left[:, rows, columns], self.config)
+        total = aggregate(cost, left[:, rows, columns].where(region, 0), self.config)
         # A right pixel lies in the image if its column does: column >= layer + least, and the same at the other end.
         reach = (columns.start - least, right.shape[2] - 1 - columns.start + least)
-        found, margin = winners(total, region, reach, self.config.consistency)
+        found, margin = winners(total, region, reach, self.config)
         found = smooth(without_islands(found, self.config.min_island), self.config.smoothing)
         values[:, rows, columns] = found + least
         confidence[:, rows, columns] = margin.where(~found.isnan(), 0).to(confidence)
@@ -237,7 +237,7 @@ def sum_paths(
 
 
 def winners(
-    total: Volume, region: Bool[Tensor, "batch h w"], reach: tuple[int, int], consistency: int
+    total: Volume, region: Bool[Tensor, "batch h w"], reach: tuple[int, int], config: SemiGlobalConfig
 ) -> tuple[Float[Tensor, "batch h w"], Float[Tensor, "batch h w"]]:
     """The layer of the least sum, to a fraction, NaN where the right image disagrees; and its margin, 0 to 1.
 
@@ -263,7 +263,9 @@ def winners(
     layer = (best & (MOST_LAYERS - 1)).long()
     match = torch.arange(width, device=total.device) - layer
     other = right_best.gather(2, match + layers - 1) & (MOST_LAYERS - 1)
-    agreed = region & (match >= -reach[0]) & (match <= reach[1]) & ((other - layer).abs() <= consistency)
+    agreed = (
+        region & (match >= -reach[0]) & (match <= reach[1]) & ((other - layer).abs() <= config.consistency)
+    )
 
     sides = (layer[:, :, None] + torch.tensor([-1, 0, 1], device=total.device)[:, None]).clamp(0, layers - 1)
     below, here, above = total.gather(2, sides).to(torch.float32).unbind(2)
@@ -272,7 +274,7 @@ def winners(
     shift = 0.5 * (below - above) / (torch.maximum(below, above) - here).clamp_min(1)
     inner = (layer > 0) & (layer < layers - 1)  # at either end of the range a side is missing
     found = torch.where(agreed, layer + shift.where(inner, 0), torch.nan)
-    margin = (second - here) / second.clamp_min(1)
+    margin = (second - here) / (second + config.bits)
     return found.transpose(0, 1), margin.clamp_min(0).transpose(0, 1)
 
 

@@ -72,14 +72,16 @@ class OpenCVMatcher(StereoMatcher):
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
         values = torch.full_like(left, torch.nan)
-        rows, columns = mask.any(2).any(0).nonzero()[:, 0], mask.any(1).any(0).nonzero()[:, 0]
-        above, below = int(rows[0]), int(rows[-1]) + 1
-        # OpenCV answers nothing in the first columns, for which the right image may not reach.
-        start, end = (
-            max(0, int(columns[0]) - least - count),
-            min(left.shape[2], int(columns[-1]) + 1 - min(least, 0)),
-        )
         for index, pair in enumerate(zip(left, right, strict=True)):
+            rows, columns = mask[index].any(1).nonzero()[:, 0], mask[index].any(0).nonzero()[:, 0]
+            if len(rows) == 0:
+                continue
+            above, below = int(rows[0]), int(rows[-1]) + 1
+            # OpenCV answers nothing in the first columns, for which the right image may not reach.
+            start = max(0, int(columns[0]) - max(0, least + count))
+            end = min(left.shape[2], int(columns[-1]) + 1 - min(least, 0))
+            if end - start + min(least, 0) <= max(0, least + count):
+                continue
             images = [_eight_bit(image[above:below, start:end]) for image in pair]
             found = torch.from_numpy(matcher.compute(*images).astype(np.float32) / 16).to(left)
             found = found.where((found >= least) & (found <= greatest), torch.nan)
