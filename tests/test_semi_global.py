@@ -22,13 +22,19 @@ from torchpose.vision.semi_global import (
 )
 
 Radius = tuple[int, int]
+NOISE = 0.25  # of the census: neighbours of `few_greys` differ by multiples of 0.2
+
+
+def config_of(radius: Radius) -> SemiGlobalConfig:
+    """Any window, without room for steps."""
+    return SemiGlobalConfig(radius=radius, noise=NOISE, small_step=0, large_step=0, least_step=0)
 
 
 def census_by_loop(grey: np.ndarray, y: int, x: int, radius: Radius) -> list[bool]:
-    """Whether each neighbour of a pixel, row by row, is brighter than it; beyond the image its edge repeats."""
+    """Whether each neighbour of a pixel, row by row, is brighter than it by the noise; beyond the image its edge repeats."""
     height, width = grey.shape
     return [
-        bool(grey[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)] > grey[y, x])
+        bool(grey[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)] > grey[y, x] + NOISE)
         for dy in range(-radius[0], radius[0] + 1)
         for dx in range(-radius[1], radius[1] + 1)
         if (dy, dx) != (0, 0)
@@ -43,7 +49,7 @@ def few_greys(*shape: int) -> Tensor:
 @pytest.mark.parametrize("radius", [(2, 2), (1, 1), (0, 1), (3, 1), (1, 4), (3, 3)])
 def test_a_census_says_which_neighbours_are_brighter(radius: Radius) -> None:
     grey = few_greys(2, 11, 13)
-    planes = census(grey, radius)
+    planes = census(grey, config_of(radius))
     bits = (2 * radius[0] + 1) * (2 * radius[1] + 1) - 1
     assert planes.shape == (-(-bits // 8), 2, 11 - 2 * radius[0], 13 - 2 * radius[1])
     for item, y, x in itertools.product(range(2), range(planes.shape[2]), range(planes.shape[3])):
@@ -78,7 +84,7 @@ def test_a_cost_is_the_bits_that_differ(
     left, right = few_greys(2, 9, 17), few_greys(2, 9, 17)
     rows, columns = box
     region = (torch.rand(2, 9, 17) < 0.8)[:, rows, columns]
-    cost = matching_cost(left, right, region, rows, columns, least, greatest, radius)
+    cost = matching_cost(left, right, region, rows, columns, least, greatest, config_of(radius))
     assert cost.shape == (region.shape[1], 2, greatest - least + 1, region.shape[2])
     bits = (2 * radius[0] + 1) * (2 * radius[1] + 1) - 1
     expected = np.zeros(cost.shape, dtype=np.uint8)
@@ -284,6 +290,7 @@ def test_pixels_off_the_mask_have_no_influence() -> None:
         ({"least_step": 40}, "got 12, 40 and 39"),
         ({"large_step": 40}, "large_step must be at most 39 beside 24 bits of census, .* got 40"),
         ({"radius": (3, 3)}, "large_step must be at most 15 beside 48 bits"),
+        ({"noise": -0.1}, "noise must not be negative, got -0.1"),
         ({"edge": 0.0}, "edge must be positive, got 0.0; .inf makes P2 the same everywhere"),
         ({"edge": float("nan")}, "edge must be positive, got nan"),
         ({"consistency": -1}, "consistency must not be negative, got -1; 0 is the strictest"),

@@ -20,7 +20,9 @@ from torchpose.vision.disparity import Disparity
 from torchpose.vision.faces import FaceDetector, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
 from torchpose.vision.points import PointCloud, group_cells, sample_grid
+from torchpose.vision.semi_global import SemiGlobal, SemiGlobalConfig
 from torchpose.vision.silhouette import person_silhouette
+from torchpose.vision.stereo import MatcherKind, StereoConfig, stereo_matcher
 
 __all__ = [
     "ANATOMICAL_NAMES",
@@ -38,7 +40,9 @@ __all__ = [
     "Faces",
     "Frame",
     "GrowingSeeds",
+    "GrowingSeedsConfig",
     "LMConfig",
+    "MatcherKind",
     "Observation",
     "PartLikelihood",
     "PointCloud",
@@ -51,7 +55,10 @@ __all__ = [
     "Recording",
     "Registrar",
     "RegistrationConfig",
+    "SemiGlobal",
+    "SemiGlobalConfig",
     "StereoCamera",
+    "StereoConfig",
     "StereoToPose",
     "TrackStatus",
     "Tracker",
@@ -71,5 +78,6 @@ __all__ = [
     "read_poses_npz",
     "read_skeletons",
     "sample_grid",
+    "stereo_matcher",
     "write_recording",
 ]

@@ -21,6 +21,7 @@ from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
+from torchpose.scaled import at_most
 from torchpose.session import Session, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups, describe
 from torchpose.study import (
@@ -54,6 +55,9 @@ class InferConfig:
     background: str | None = None  # folder with images of the empty scene, instead of the folder's own
     output: str = "runs/infer"  # folder for the results
     max_frames: int | None = None  # take only the first so many frames; a camera needs it
+    max_width: int = (
+        800  # px; larger images are shrunk as they are read: twice the width costs eight times the matching
+    )
     fresh: bool = False  # start over instead of continuing an interrupted run
     seed: int = 0  # the same seed gives the same results
     device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
@@ -75,6 +79,10 @@ class InferConfig:
                 )
         if self.max_frames is not None and self.max_frames < 1:
             raise ValueError(f"max_frames must be at least 1, got {self.max_frames}; null takes all frames")
+        if self.max_width < 64:
+            raise ValueError(
+                f"max_width must be at least 64 px, got {self.max_width}; 640 to 1280 make sense"
+            )
         _check_machine(self.seed, self.threads)
 
 
@@ -164,6 +172,7 @@ def infer(config: InferConfig, device: torch.device) -> None:
         config = _captured(config, output / "recording")
         assert config.recording is not None
         recording = open_recording(config.recording, config.right, config.calibration, config.background)
+    recording = at_most(recording, config.max_width)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
     session = Session(model, recording, output, settings_of(config), __version__)
     print(summary_table(session.run(config.fresh, config.max_frames), output))

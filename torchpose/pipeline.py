@@ -189,11 +189,11 @@ class Eyes(nn.Module):
 
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
         """Learn the empty scene from its frames, or where there are none from the recording itself."""
-        spread = _spread(len(recording), self.config.background_frames)
+        spread = spread_positions(len(recording), self.config.background_frames)
         if self.camera.baseline is None:
             depth = backgrounds.depth
             if depth is None:
-                depth = far_readings(_stack([frame.depth for frame in _readable(recording, spread)]))
+                depth = far_readings(_stack([frame.depth for frame in readable_frames(recording, spread)]))
             self.background = DepthBackground(depth.to(device), self.config.depth_background)
             self.background_depth = self.background.depth
             return
@@ -203,13 +203,18 @@ class Eyes(nn.Module):
                 pair = left.median(0, keepdim=True).values, right.median(0, keepdim=True).values
                 disparity = self.stereo(*pair, disparity_range=(0, self.disparity_range[1])).values[0]
         else:
-            frames = list(_readable(recording, spread))
+            frames = list(readable_frames(recording, spread))
             left, right = (
                 _stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right")
             )
             with self.stopwatch.measure("background"):
                 scene = learn_empty_scene(
-                    left, right, self.stereo, self.camera, (0, self.disparity_range[1]), self.config.empty_scene
+                    left,
+                    right,
+                    self.stereo,
+                    self.camera,
+                    (0, self.disparity_range[1]),
+                    self.config.empty_scene,
                 )
             left, right, disparity = scene.left, scene.right, scene.disparity
         disparity = bridge_gaps(disparity)  # a bare wall and a glaring floor match nowhere but at their rims
@@ -352,7 +357,7 @@ class StereoToPose(nn.Module):
         self.learn_background(recording)
         self.tracker.forget()
         self.eyes.last = None
-        frames = _readable(recording, _spread(len(recording), self.config.size_frames))
+        frames = readable_frames(recording, spread_positions(len(recording), self.config.size_frames))
         # These frames come again in their turn; what was seen of them is kept until then.
         self._seen = {frame.index: self.eyes(frame, self.device) for frame in frames}
         with self.stopwatch.measure("size"):
@@ -455,11 +460,13 @@ def _touches_border(mask: Bool[Tensor, "height width"]) -> bool:
     return int(edge.sum()) > 4
 
 
-def _spread(length: int, count: int) -> list[int]:
+def spread_positions(length: int, count: int) -> list[int]:
+    """At most `count` positions from 0 to length - 1, evenly apart."""
     return sorted({round(i * (length - 1) / max(count - 1, 1)) for i in range(min(count, length))})
 
 
-def _readable(recording: Recording, positions: list[int]) -> Iterator[Frame]:
+def readable_frames(recording: Recording, positions: list[int]) -> Iterator[Frame]:
+    """The frames at these positions that can be read."""
     for position in positions:
         try:
             yield recording[position]

@@ -6,9 +6,11 @@ Angles are in radians in memory and in degrees in the files; metres, left-camera
 import dataclasses
 import hashlib
 import json
+import math
 import shutil
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,9 +34,11 @@ from torchpose.export import (
     write_summary,
 )
 from torchpose.figures import Overlay, draw_overlay, plot_angles
-from torchpose.pipeline import FramePose, StereoToPose, depth_picture
+from torchpose.pipeline import FramePose, StereoToPose, depth_picture, readable_frames, spread_positions
 from torchpose.recording import Recording, UnreadableFrame
+from torchpose.vision.alignment import alignment_warning, measure_alignment
 
+CHECKED = 3  # frames whose rows are compared
 PART = 50  # frames between two savings: what an interruption costs at the most
 _EYES = "eyes_"  # before the names of the eyes' state, beside the tracker's
 _SHOWN = ("elbow_flexion_left", "elbow_flexion_right", "knee_flexion_left", "knee_flexion_right")
@@ -71,6 +75,7 @@ class Session:
         """
         begin, count = time.perf_counter(), min(len(self.recording), max_frames or len(self.recording))
         done = self._resume(fresh)
+        rows_apart = self._check_rows()
         if done < count:
             self.model.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
             self._follow(done, count)
@@ -81,9 +86,26 @@ class Session:
             plot_angles(self.output / "angles.png", sequence)
             self._draw(sequence, labelled)
         summary = self._summary(sequence, time.perf_counter() - begin, count - done)
+        summary["rows_apart_px"] = rows_apart
         write_summary(self.output / "summary.json", summary)
         shutil.rmtree(self.parts)
         return summary
+
+    def _check_rows(self) -> float | None:
+        """How far apart the rows of a recording's left and right images are, px, with a warning where it spoils depth.
+
+        None for a depth camera, and where too few points are seen in both images.
+        """
+        frames = list(readable_frames(self.recording, spread_positions(len(self.recording), CHECKED)))
+        left = [frame.left for frame in frames if frame.left is not None]
+        right = [frame.right for frame in frames if frame.right is not None]
+        if not right:
+            return None
+        alignment = measure_alignment(torch.stack(left), torch.stack(right))
+        sentence = alignment_warning(alignment)
+        if sentence:
+            warnings.warn(sentence, stacklevel=2)
+        return None if math.isnan(alignment.typical) else alignment.typical
 
     def _resume(self, fresh: bool) -> int:
         """How many frames the parts of an interrupted run hold; they are removed if they are not ours."""

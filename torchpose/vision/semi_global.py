@@ -30,6 +30,7 @@ class SemiGlobalConfig:
     """What smoothness costs, in bits of the census, and which matches are kept."""
 
     radius: tuple[int, int] = (2, 2)  # px, half the height and width of the census window
+    noise: float = 1 / 255  # a neighbour is brighter by more than that: lest noise should match on flat cloth
     small_step: int = 12  # P1, of a disparity 1 px off the path's last
     large_step: int = 39  # P2, of one farther off, within a surface
     least_step: int = 16  # P2 at the strongest edges of the image, where surfaces end
@@ -51,6 +52,8 @@ class SemiGlobalConfig:
                 f"large_step must be at most {HIGHEST - self.bits} beside {self.bits} bits of census, for the sum of "
                 f"{PATHS} paths to fit into a byte, got {self.large_step}"
             )
+        if self.noise < 0:
+            raise ValueError(f"noise must not be negative, got {self.noise}; 1 / 255 is a level of 8 bits")
         if not self.edge > 0:
             raise ValueError(f"edge must be positive, got {self.edge}; .inf makes P2 the same everywhere")
         for name in ("consistency", "min_island", "smoothing"):
@@ -79,8 +82,9 @@ class SemiGlobal(StereoMatcher):
 
     All sums fit into bytes, of which a processor adds 32 at a time. Pixels off the mask cost nothing at any
     disparity, so what lies there has no influence. The confidence is the margin to the best disparity more
-    than 1 px away, as a share of its sum (and of one census, lest sums near 0 should count). Seeds do not help this method: narrow the range instead. The memory
-    is 4 bytes a cell over the masks' bounding box: 80 MB for 640 x 480 with 64 disparities.
+    than 1 px away, as a share of its sum (and of one census, lest sums near 0 should count). Seeds do not help
+    this method: narrow the range instead. The memory is 4 bytes a cell over the masks' bounding box: 80 MB for
+    640 x 480 with 64 disparities.
     """
 
     def __init__(self, config: SemiGlobalConfig = SemiGlobalConfig()) -> None:
@@ -105,7 +109,7 @@ class SemiGlobal(StereoMatcher):
         rows, columns = _extent(mask.any(2).any(0)), _extent(mask.any(1).any(0))
         values, confidence = torch.full_like(left, torch.nan), torch.zeros_like(left)
         region = mask[:, rows, columns]
-        cost = matching_cost(left, right, region, rows, columns, least, greatest, self.config.radius)
+        cost = matching_cost(left, right, region, rows, columns, least, greatest, self.config)
         total = aggregate(cost, left[:, rows, columns].where(region, 0), self.config)
         # A right pixel lies in the image if its column does: column >= layer + least, and the same at the other end.
         reach = (columns.start - least, right.shape[2] - 1 - columns.start + least)
@@ -124,19 +128,18 @@ def matching_cost(
     columns: slice,
     least: int,
     greatest: int,
-    radius: tuple[int, int],
+    config: SemiGlobalConfig,
 ) -> Volume:
     """Bits in which the census transforms differ: all of them beyond the right image, none off the region's mask."""
     count, height, width = region.shape
-    up, across = radius
-    bits = (2 * up + 1) * (2 * across + 1) - 1
+    up, across = config.radius
     wide = -(-width // WORD) * WORD
     top, first = rows.start, columns.start
     high, beyond = height + 2 * up, wide + 2 * across
-    ours = census(crop_beyond(left, top - up, first - across, high, beyond), radius)
+    ours = census(crop_beyond(left, top - up, first - across, high, beyond), config)
     # The right image from the column that the greatest disparity sees.
     start = first - greatest
-    theirs = census(crop_beyond(right, top - up, start - across, high, beyond + greatest - least), radius)
+    theirs = census(crop_beyond(right, top - up, start - across, high, beyond + greatest - least), config)
     differ, spare = torch.empty_like(ours), torch.empty_like(ours)
     counted = region.to(torch.uint8)
     cost = counted.new_empty(height, count, greatest - least + 1, width)
@@ -146,21 +149,21 @@ def matching_cost(
         count_bits(differ, spare)
         plane = differ.sum(0, dtype=torch.uint8)[..., :width]
         seen = start + shift  # column of the right image that the region's first sees
-        plane[..., : max(0, -seen)] = bits
-        plane[..., max(0, right.shape[2] - seen) :] = bits
+        plane[..., : max(0, -seen)] = config.bits
+        plane[..., max(0, right.shape[2] - seen) :] = config.bits
         torch.mul(plane, counted, out=cost[:, :, layer].transpose(0, 1))
     return cost
 
 
-def census(grey: Grey, radius: tuple[int, int]) -> Census:
+def census(grey: Grey, config: SemiGlobalConfig) -> Census:
     """Which neighbours in the window are brighter than its centre, eight to a byte, for the windows inside an image."""
-    up, across = radius
+    up, across = config.radius
     height, width = grey.shape[1] - 2 * up, grey.shape[2] - 2 * across
-    centre = grey[:, up : up + height, across : across + width]
+    bar = grey[:, up : up + height, across : across + width] + config.noise
     offsets = [(y, x) for y in range(2 * up + 1) for x in range(2 * across + 1) if (y, x) != (up, across)]
-    planes = torch.zeros(-(-len(offsets) // 8), *centre.shape, dtype=torch.uint8, device=grey.device)
+    planes = torch.zeros(-(-len(offsets) // 8), *bar.shape, dtype=torch.uint8, device=grey.device)
     for index, (y, x) in enumerate(offsets):
-        brighter = grey[:, y : y + height, x : x + width] > centre
+        brighter = grey[:, y : y + height, x : x + width] > bar
         planes[index // 8] |= brighter.view(torch.uint8) << index % 8
     return planes
 
