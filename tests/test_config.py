@@ -225,6 +225,7 @@ def test_help_lists_every_setting_with_its_meaning(kind: Kind):
     ("override", "message"),
     [
         ("max_frames=0", "max_frames must be at least 1, got 0"),
+        ("max_width=8", "max_width must be at least 64 px, got 8"),
         ("seed=-1", "seed must be 0 or more, got -1"),
         ("threads=0", "threads must be at least 1, got 0"),
     ],
