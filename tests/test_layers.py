@@ -28,6 +28,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "silhouette",
         "focal_length",
         "points",
+        "skin",
         "faces",
         "alignment",
         "calibrate",

@@ -43,12 +43,13 @@ from torchpose.vision.background import (
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.disparity import bridge_gaps
 from torchpose.vision.empty_scene import EmptySceneConfig, learn_empty_scene
-from torchpose.vision.faces import FaceConfig, FaceDetector, Faces
+from torchpose.vision.faces import FaceConfig, FaceDetector, FaceMemory, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds
 from torchpose.vision.photometry import temporal_median
 from torchpose.vision.points import CellConfig, PointCloud, SamplingConfig, group_cells, sample_grid
 from torchpose.vision.scene_match import SceneMatch, SceneMatchConfig
 from torchpose.vision.silhouette import SilhouetteConfig, person_silhouette, search_region
+from torchpose.vision.skin import SkinModel
 from torchpose.vision.stereo import StereoConfig, stereo_matcher
 
 
@@ -118,6 +119,7 @@ class LastSight:
     time_s: float
     silhouette: Bool[Tensor, "1 height width"]
     disparity: Float[Tensor, "1 height width"] | None  # px, of the person alone; None: a depth camera
+    face: FaceMemory | None
 
 
 class Stopwatch:
@@ -229,17 +231,22 @@ class Eyes(nn.Module):
             return {}
         time_s = torch.tensor(self.last.time_s, dtype=torch.float64)
         state = {"time_s": time_s, "silhouette": self.last.silhouette}
+        if self.last.face is not None:
+            state |= {"face": self.last.face.box}
+            state |= {f"skin_{name}": value for name, value in vars(self.last.face.skin).items()}
         return state if self.last.disparity is None else state | {"disparity": self.last.disparity}
 
     def restore(self, state: dict[str, Tensor], device: torch.device) -> None:
         """Take up what `state` gave."""
         self.last = None
         if state:
-            disparity = state.get("disparity")
+            disparity, box = state.get("disparity"), state.get("face")
+            skin = {name[5:]: value.to(device) for name, value in state.items() if name.startswith("skin_")}
             self.last = LastSight(
                 float(state["time_s"]),
                 state["silhouette"].to(device),
                 None if disparity is None else disparity.to(device),
+                None if box is None else FaceMemory(box.to(device), SkinModel(**skin)),
             )
 
     def forward(self, frame: Frame, device: torch.device) -> Sight:
@@ -286,11 +293,11 @@ class Eyes(nn.Module):
             ).mask
             seen = depth.where(silhouette, torch.nan)
             matched = None if self.camera.baseline is None else self.camera.disparity(seen)
-            self.last = LastSight(frame.time_s, silhouette, matched)
         with self.stopwatch.measure("points"):
             cloud = sample_grid(depth, silhouette, self.camera, self.config.sampling)
         with self.stopwatch.measure("faces"):
-            faces = self.find_faces(images, silhouette, depth, self.camera)
+            faces = self.find_faces(images, silhouette, depth, self.camera, last.face if last else None)
+        self.last = LastSight(frame.time_s, silhouette, matched, faces.memory)
         present = int(cloud.mask.sum()) >= self.config.min_points
         return Sight(images, depth, silhouette, cloud, faces, present, _touches_border(silhouette[0]))
 
