@@ -4,8 +4,10 @@ python -m benchmarks.real ../shared/data [--output docs/figures]
 
 stereo_people  five pairs by a passive camera, disparity by each matcher: the scale is unknown, so only pictures
 oakd_overhead  a video by an OAK-D from above in hard sunlight, rectified with its 14-coefficient calibration: how far
-               apart its rows are before and after, and the person beside plain subtraction, which takes the shadow too
+               apart its rows are before, after, and once corrected by what they show themselves, by frames that the
+               correction has not seen too, and the person beside plain subtraction, which takes the shadow too
 
+The rows of stereo_people are told as they come and corrected; its pairs were never calibrated.
 The empty scene of the second is that of three frames of the video without anybody.
 """
 
@@ -21,29 +23,36 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from torchpose.aligned import align_recording
 from torchpose.atomic import replacing
 from torchpose.pipeline import Eyes, EyesConfig
-from torchpose.recording import Backgrounds, Frame, open_recording
+from torchpose.recording import Backgrounds, Frame, Recording, open_recording
 from torchpose.scaled import ScaledRecording
 from torchpose.video import VideoFile
-from torchpose.vision.alignment import Alignment, measure_alignment
+from torchpose.vision.alignment import Alignment, align_rows, measure_alignment
 from torchpose.vision.stereo import MatcherKind, StereoConfig, stereo_matcher
 
 CORRIDOR_RANGE = (0, 79)  # px; the pairs have an offset of about 18
 EMPTY = (140, 165, 590)  # frames of the video without anybody
 PERSON = (72, 234, 252, 270, 414, 432, 504, 522)  # with one, walking in and out
-CHECKED = (60, 120, 240, 360, 480, 600)  # whose rows are compared
+CHECKED = (60, 140, 240, 360, 480, 600)  # whose rows are compared; others than those that are corrected by
 COLOUR_THRESHOLD = 0.06  # of the plain subtraction
 TILE = 400  # px, width of a picture in a sheet
 
 Picture = UInt8[np.ndarray, "height width 3"]  # BGR
 
 
-def corridor(folder: Path) -> Picture:
-    """The pairs in columns: left image, then the disparity by each matcher."""
+def corridor(folder: Path) -> tuple[Picture, dict[str, float]]:
+    """The pairs in columns: left image, then the disparity by each matcher; and how far apart the rows are."""
+    lefts, rights = (
+        torch.stack([_image(path) for path in sorted((folder / side).glob("*.png"))])
+        for side in ("left", "right")
+    )
+    before = measure_alignment(lefts, rights)
+    rights = align_rows(rights, before)
+    after = measure_alignment(lefts, rights)
     rows: list[list[Picture]] = [[] for _ in range(1 + len(MatcherKind))]
-    for path in sorted((folder / "left").glob("*.png")):
-        left, right = (_image(folder / side / path.name) for side in ("left", "right"))
+    for path, left, right in zip(sorted((folder / "left").glob("*.png")), lefts, rights, strict=True):
         rows[0].append(_titled(_picture(left), f"{path.stem}, left image"))
         for row, kind in zip(rows[1:], MatcherKind, strict=True):
             found = stereo_matcher(StereoConfig(matcher=kind))(
@@ -53,7 +62,7 @@ def corridor(folder: Path) -> Picture:
             row.append(
                 _titled(_coloured(found.values[0], CORRIDOR_RANGE), f"{kind.value}, {share:.0%} answered")
             )
-    return np.vstack([np.hstack(row) for row in rows])
+    return np.vstack([np.hstack(row) for row in rows]), _rows("raw", before) | _rows("corrected", after)
 
 
 def overhead(folder: Path, kind: MatcherKind) -> tuple[Picture, dict[str, float]]:
@@ -61,11 +70,9 @@ def overhead(folder: Path, kind: MatcherKind) -> tuple[Picture, dict[str, float]
     whole = open_recording(folder / "left.mp4", folder / "right.mp4", folder / "calib.json")
     raw = [VideoFile(folder / f"{side}.mp4") for side in ("left", "right")]
     before = measure_alignment(*(torch.stack([_raw(video, number) for number in CHECKED]) for video in raw))
-    frames = [whole[number] for number in CHECKED]
-    after = measure_alignment(
-        *(torch.stack([_side(frame, side) for frame in frames]) for side in ("left", "right"))
-    )
-    recording = ScaledRecording(whole, 0.5)
+    corrected = align_recording(whole)
+    after, left_over = (_alignment(recording) for recording in (whole, corrected))
+    recording = ScaledRecording(corrected, 0.5)
     eyes = Eyes(recording.camera, EyesConfig(nearest=0.7, farthest=4.0, stereo=StereoConfig(matcher=kind)))
     empty = [recording[number] for number in EMPTY]
     backgrounds = Backgrounds(
@@ -86,7 +93,14 @@ def overhead(folder: Path, kind: MatcherKind) -> tuple[Picture, dict[str, float]
             _titled(_coloured(disparity, eyes.disparity_range), f"disparity ({kind.value})"),
         )
         sheet.append(np.hstack(tiles))
-    return np.vstack(sheet), _rows("raw", before) | _rows("rectified", after)
+    return np.vstack(sheet), _rows("raw", before) | _rows("rectified", after) | _rows("corrected", left_over)
+
+
+def _alignment(recording: Recording) -> Alignment:
+    frames = [recording[number] for number in CHECKED]
+    return measure_alignment(
+        *(torch.stack([_side(frame, side) for frame in frames]) for side in ("left", "right"))
+    )
 
 
 def _rows(name: str, alignment: Alignment) -> dict[str, float]:
@@ -162,13 +176,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
             return 2
     options.output.mkdir(parents=True, exist_ok=True)
-    video, figures = overhead(options.data / "oakd_overhead", MatcherKind(options.matcher))
-    sheets = {"stereo_people": corridor(options.data / "stereo_people"), "oakd_overhead": video}
+    video, rows = overhead(options.data / "oakd_overhead", MatcherKind(options.matcher))
+    people, people_rows = corridor(options.data / "stereo_people")
+    sheets = {"stereo_people": people, "oakd_overhead": video}
     for name, sheet in sheets.items():
         _, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, 80])
         with replacing(options.output / f"{name}.jpg") as partial:
             partial.write_bytes(data.tobytes())
-    print(json.dumps(figures, indent=1))
+    print(json.dumps({"stereo_people": people_rows, "oakd_overhead": rows}, indent=1))
     return 0
 
 

@@ -43,7 +43,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "synthesis": ("motion", "room", "render", "database"),
     "learning": ("part_network", "training"),
     "the desk": (
-        *("depthai", "calibration", "video", "recording", "scaled", "capture", "rendered", "export", "figures"),
+        *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
+        *("export", "figures"),
         *("pipeline", "session", "clips", "study", "cli"),
     ),
 }

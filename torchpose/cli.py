@@ -16,6 +16,7 @@ import torch
 from torchpose.activity.dataset import Clip, Fold, Split, read_skeletons, split_clips
 from torchpose.activity.features import FeatureKind
 from torchpose.activity.recognizer import RecognizerConfig
+from torchpose.aligned import AlignedRecording, align_recording
 from torchpose.capture import camera_numbers, capture_recording, open_cameras
 from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
@@ -58,6 +59,7 @@ class InferConfig:
     max_width: int = (
         800  # px; larger images are shrunk as they are read: twice the width costs eight times the matching
     )
+    align: bool = True  # move the right images' rows onto the left's where they are more than 0.25 px apart
     fresh: bool = False  # start over instead of continuing an interrupted run
     seed: int = 0  # the same seed gives the same results
     device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
@@ -172,9 +174,15 @@ def infer(config: InferConfig, device: torch.device) -> None:
         config = _captured(config, output / "recording")
         assert config.recording is not None
         recording = open_recording(config.recording, config.right, config.calibration, config.background)
+    rows_before = None
+    if config.align:
+        recording = align_recording(recording)
+        if isinstance(recording, AlignedRecording):
+            shrunk = min(1.0, config.max_width / recording.camera.width)
+            rows_before = recording.alignment.typical * shrunk
     recording = at_most(recording, config.max_width)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    session = Session(model, recording, output, settings_of(config), __version__)
+    session = Session(model, recording, output, settings_of(config), __version__, rows_before)
     print(summary_table(session.run(config.fresh, config.max_frames), output))
 
 

@@ -19,7 +19,14 @@ from torch import Tensor, nn
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, angle_sd, limb_angles
 from torchpose.body.model import BodyConfig, BodyModel
 from torchpose.export import PoseSequence
-from torchpose.recording import Backgrounds, Frame, Recording, UnreadableFrame
+from torchpose.recording import (
+    Backgrounds,
+    Frame,
+    Recording,
+    UnreadableFrame,
+    readable_frames,
+    spread_positions,
+)
 from torchpose.registration.geodesic import geodesic_bounds, geodesic_term
 from torchpose.registration.likelihood import (
     AppearanceConfig,
@@ -465,20 +472,6 @@ def _touches_border(mask: Bool[Tensor, "height width"]) -> bool:
     """Whether a few pixels of a mask lie on the image's edge; the sides of stereo's blind strip count as inside."""
     edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
     return int(edge.sum()) > 4
-
-
-def spread_positions(length: int, count: int) -> list[int]:
-    """At most `count` positions from 0 to length - 1, evenly apart."""
-    return sorted({round(i * (length - 1) / max(count - 1, 1)) for i in range(min(count, length))})
-
-
-def readable_frames(recording: Recording, positions: list[int]) -> Iterator[Frame]:
-    """The frames at these positions that can be read."""
-    for position in positions:
-        try:
-            yield recording[position]
-        except UnreadableFrame:
-            continue
 
 
 def _stack(values: list[Tensor | None]) -> Tensor:

@@ -348,6 +348,20 @@ def _video_in(folder: Path, side: str) -> list[Path]:
     return files
 
 
+def spread_positions(length: int, count: int) -> list[int]:
+    """At most `count` positions from 0 to length - 1, evenly apart."""
+    return sorted({round(i * (length - 1) / max(count - 1, 1)) for i in range(min(count, length))})
+
+
+def readable_frames(recording: Recording, positions: list[int]) -> Iterator[Frame]:
+    """The frames at these positions that can be read."""
+    for position in positions:
+        try:
+            yield recording[position]
+        except UnreadableFrame:
+            continue
+
+
 def write_recording(
     folder: str | Path,
     camera: StereoCamera,

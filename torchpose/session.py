@@ -34,9 +34,9 @@ from torchpose.export import (
     write_summary,
 )
 from torchpose.figures import Overlay, draw_overlay, plot_angles
-from torchpose.pipeline import FramePose, StereoToPose, depth_picture, readable_frames, spread_positions
-from torchpose.recording import Recording, UnreadableFrame
-from torchpose.vision.alignment import alignment_warning, measure_alignment
+from torchpose.pipeline import FramePose, StereoToPose, depth_picture
+from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
+from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 
 CHECKED = 3  # frames whose rows are compared
 PART = 50  # frames between two savings: what an interruption costs at the most
@@ -53,7 +53,11 @@ class _Labelled:
 
 
 class Session:
-    """Runs a model over a recording into a folder. The same settings on the same recording go on where they stopped."""
+    """Runs a model over a recording into a folder. The same settings on the same recording go on where they stopped.
+
+    `rows_before` is how far apart, in px of the recording's images, the rows were before they were corrected; None
+    where they were not.
+    """
 
     def __init__(
         self,
@@ -62,9 +66,10 @@ class Session:
         output: Path,
         settings: Mapping[str, Any],
         version: str,
+        rows_before: float | None = None,
     ):
         self.model, self.recording, self.output = model, recording, output
-        self.settings, self.version = settings, version
+        self.settings, self.version, self.rows_before = settings, version, rows_before
         self.parts = output / "parts"
         self.problems: list[str] = []
 
@@ -86,7 +91,7 @@ class Session:
             plot_angles(self.output / "angles.png", sequence)
             self._draw(sequence, labelled)
         summary = self._summary(sequence, time.perf_counter() - begin, count - done)
-        summary["rows_apart_px"] = rows_apart
+        summary |= {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before}
         write_summary(self.output / "summary.json", summary)
         shutil.rmtree(self.parts)
         return summary
@@ -94,7 +99,7 @@ class Session:
     def _check_rows(self) -> float | None:
         """How far apart the rows of a recording's left and right images are, px, with a warning where it spoils depth.
 
-        None for a depth camera, and where too few points are seen in both images.
+        A correction is told, too. None for a depth camera, and where too few points are seen in both images.
         """
         frames = list(readable_frames(self.recording, spread_positions(len(self.recording), CHECKED)))
         left = [frame.left for frame in frames if frame.left is not None]
@@ -102,10 +107,14 @@ class Session:
         if not right:
             return None
         alignment = measure_alignment(torch.stack(left), torch.stack(right))
-        sentence = alignment_warning(alignment)
+        typical = None if math.isnan(alignment.typical) else alignment.typical
+        if self.rows_before is None:
+            sentence = alignment_warning(alignment)
+        else:
+            sentence = correction_warning(self.rows_before, typical)
         if sentence:
             warnings.warn(sentence, stacklevel=2)
-        return None if math.isnan(alignment.typical) else alignment.typical
+        return typical
 
     def _resume(self, fresh: bool) -> int:
         """How many frames the parts of an interrupted run hold; they are removed if they are not ours."""

@@ -1,19 +1,24 @@
 """Row alignment of a stereo pair: how far apart a rectified pair's two images of a point lie, in rows.
 
 Every matcher here searches along a row. A row that is half a pixel off costs matches and depth, and nothing
-else shows why, so this is measured on the pictures themselves. Pixels; rows count downwards.
+else shows why, so this is measured on the pictures themselves, and the right image is moved by what was measured.
+Pixels; rows count downwards.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
 WARN_ABOVE = 0.5  # px
+CORRECT_ABOVE = 0.25  # px, root mean square; less is left alone, for resampling blurs
 AGREE_WITHIN = 2.0  # px of spread; beyond it the matches follow no one error of the rig
 MIN_MATCHES = 20
 CALIBRATE = "python -m torchpose.vision.calibrate --help"
@@ -33,6 +38,41 @@ MAX_REFINEMENT = 4.0  # px, from the corner found in the right image
 MAX_RETURN = 0.3  # px, how far a match may end from its start when followed back
 REACH = (0.1, 0.5)  # share of the height and of the width, within which a match is looked for
 
+NUM_TERMS = 5  # of the smooth difference: 1, x, y, x y, y^2
+FOLDS = 5  # of the cross-validation; a tile of the image is held out as a whole, as matches in it overlap
+PREFERENCE = 2.0  # standard errors by which more terms must foretell what is held out better than fewer
+MAX_MODEL_ERROR = 0.3  # px, greatest standard error of the difference inside its box
+OUTLYING = 0.02  # share of the matches on each side that the box leaves out
+MARGIN = 0.1  # of the width, by which the box reaches beyond them: corners are sought off the border
+
+
+@dataclass(frozen=True)
+class RowModel:
+    """The rows' difference, right less left, as a smooth function of the place: what a right image is moved by.
+
+    c0 + c1 x + c2 y + c3 x y + c4 y^2, px, what turning the right camera about its axes and changing its focal length
+    do to first order: pitch (1, y^2), roll (x), yaw (x y), focal length (y). x is the right image's column and y the
+    left's row, both from the image's middle in half widths. Outside its box, where hardly a match lies, it stays at
+    what it is on the box's edge.
+    """
+
+    coefficients: tuple[float, ...]  # px, of the five terms; 0 for those that the matches do not support
+    width: int  # px, of the images
+    height: int
+    box: tuple[float, float, float, float]  # px: first and last column, first and last row
+
+    def place(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+        """Where a pixel (u, v) of the corrected right image lies in the image as it came, px.
+
+        A roll and a focal length move columns as well, by as much at the same distance from the middle: they follow.
+        """
+        u, v = pixels.unbind(-1)
+        x = _from_middle(u.clamp(*self.box[:2]), self.width, self.width)
+        y = _from_middle(v.clamp(*self.box[2:]), self.height, self.width)
+        one, roll, scale, yaw, pitch = self.coefficients
+        rows = one + roll * x + scale * y + yaw * x * y + pitch * y * y
+        return torch.stack([u + scale * x - roll * y, v + rows], -1)
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -48,6 +88,7 @@ class Alignment:
     scale: float  # slope down a column, px/px: the right image is larger by this share
     roll_error: float  # standard errors of the two
     scale_error: float
+    model: RowModel | None = None  # to correct by; None where that is no gain
 
     @property
     def error(self) -> float:
@@ -60,6 +101,7 @@ class Alignment:
 
 
 _MEDIAN_ERROR = math.sqrt(math.pi / 2)  # of a median, relative to that of a mean, for a normal error
+_Place = TypeVar("_Place", Tensor, np.ndarray)
 _TO_SD = 1.4826  # from the median absolute deviation to the standard deviation, for a normal error
 
 
@@ -89,14 +131,11 @@ def measure_alignment(
         return Alignment(nan, nan, nan, len(matches), nan, nan, nan, nan)
     rows = matches[:, 3] - matches[:, 1]
     unit = width / 2  # px, so that the columns of the design are alike in size
-    x, y = (matches[:, 0] - (width - 1) / 2) / unit, (matches[:, 1] - (height - 1) / 2) / unit
-    # What turning the right camera about its axes and changing its focal length do to first order: pitch (1, y^2),
-    # roll (x), yaw (x y), focal length (y).
-    design = np.stack([np.ones_like(x), x, y, x * y, y * y], 1)
-    modes = _least_absolute(design, rows)
+    design = _design(matches[:, 0], matches[:, 1], width, height)
+    everything = np.ones((1, len(matches)), bool), np.ones((1, NUM_TERMS), bool)
+    modes = _least_absolute(design, rows, *everything)[0]
     spread = _TO_SD * float(np.median(np.abs(rows - design @ modes)))
-    covariance = np.linalg.pinv(design.T @ design)
-    errors = _MEDIAN_ERROR * spread * np.sqrt(covariance.diagonal())
+    errors = spread * np.sqrt(_unit_covariance(design).diagonal())
     return Alignment(
         dy=float(np.median(rows)),
         typical=float(np.median(np.abs(design @ modes))),
@@ -106,7 +145,44 @@ def measure_alignment(
         scale=float(modes[2]) / unit,
         roll_error=float(errors[1]) / unit,
         scale_error=float(errors[2]) / unit,
+        model=_row_model(matches, width, height) if spread <= AGREE_WITHIN else None,
     )
+
+
+def align_rows(
+    right: Float[Tensor, "batch channels height width"], alignment: Alignment
+) -> Float[Tensor, "batch channels height width"]:
+    """The right images with their rows moved onto the left's, by cubic resampling; the rim is repeated beyond it.
+
+    Images in [0, 1], any device and float dtype; gradients flow through them. They are returned as they are without a
+    model to move them by: where the rows are within 0.25 px already (root mean square), where too few matches were
+    found, or where they agree on nothing. Raises ValueError for images of another size than those that were measured.
+    """
+    model = alignment.model
+    if model is None:
+        return right
+    height, width = right.shape[-2:]
+    if (width, height) != (model.width, model.height):
+        raise ValueError(
+            f"the right images must have the size that was measured, {model.width} x {model.height}, got "
+            f"{width} x {height}; measure these anew"
+        )
+    # Half precision has no place between the pixels of a wide image.
+    images = right if right.dtype == torch.float64 else right.float()
+    v, u = torch.meshgrid(
+        *(torch.arange(size, dtype=images.dtype, device=images.device) for size in (height, width)),
+        indexing="ij",
+    )
+    # -1 and 1 are the outer edges of the first and the last pixel.
+    grid = (model.place(torch.stack([u, v], -1)) * 2 + 1) / images.new_tensor([width, height]) - 1
+    moved = F.grid_sample(
+        images,
+        grid.expand(len(images), -1, -1, -1),
+        mode="bicubic",
+        padding_mode="border",
+        align_corners=False,
+    )
+    return moved.clamp(0, 1).to(right.dtype)
 
 
 def alignment_warning(alignment: Alignment) -> str | None:
@@ -135,6 +211,22 @@ def alignment_warning(alignment: Alignment) -> str | None:
         f"the rows of the left and right images are {alignment.typical:.2f} px apart (at most {WARN_ABOVE:g} is "
         f"good), which spoils matches and depth{cause}; calibrate again "
         f"({CALIBRATE}), or give the raw images with their calibration K1, D1, K2, D2, R, T"
+    )
+
+
+def correction_warning(before: float, after: float | None) -> str:
+    """What to tell the user of a recording that is corrected, in one sentence.
+
+    Args:
+        before: px, how far apart the rows were, `Alignment.typical`.
+        after: px, how far apart they still are; None where too few points tell.
+    """
+    left = "corrected, but too few points tell how well" if after is None else f"now {after:.2f} px"
+    spoils = ", which spoils matches and depth" if after is not None and after > WARN_ABOVE else ""
+    return (
+        f"the rows of the left and right images were {before:.2f} px apart and are {left}{spoils}: the right images "
+        f"are moved by what matched points tell, and depth is as right as the calibration; calibrate again "
+        f"({CALIBRATE})"
     )
 
 
@@ -225,11 +317,85 @@ def _follow(
     return refined[:, 0], found[:, 0] > 0
 
 
-def _least_absolute(design: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The coefficients with the least sum of absolute residuals, by least squares weighted again and again."""
-    weight = np.ones_like(values)
+def _row_model(matches: Float[np.ndarray, "num 4"], width: int, height: int) -> RowModel | None:
+    """As many terms of the difference as foretell matches that were held out; None where none do, or it is small."""
+    rows = matches[:, 3] - matches[:, 1]
+    places = matches[:, 2], matches[:, 1]  # the corrected right image's column and row
+    design = _design(*places, width, height)
+    tile = matches[:, 0] * TILES[1] // width + 2 * (matches[:, 1] * TILES[0] // height)
+    held = tile % FOLDS == np.arange(FOLDS)[:, None]  # (folds, num)
+    used = np.tri(NUM_TERMS + 1, NUM_TERMS, -1, dtype=bool)  # the first terms, from none to all
+    problems = np.repeat(~held, len(used), 0), np.tile(used, (FOLDS, 1))
+    foretold = (_least_absolute(design, rows, *problems) @ design.T).reshape(FOLDS, len(used), -1)
+    error = np.abs(rows - (foretold * held[:, None]).sum(0))  # (models, num), of the fit without the match
+    margin = MARGIN * width
+    columns, lines = (
+        (max(float(low) - margin, 0.0), min(float(high) + margin, size - 1.0))
+        for (low, high), size in zip(
+            (np.quantile(place, (OUTLYING, 1 - OUTLYING)) for place in places), (width, height), strict=True
+        )
+    )
+    lattice = np.meshgrid(np.linspace(*columns, 5), np.linspace(*lines, 5))
+    corners = _design(lattice[0].ravel(), lattice[1].ravel(), width, height)
+    fits = _least_absolute(design, rows, np.ones((len(used), len(rows)), bool), used)
+    sizes = [
+        size
+        for size, fit in enumerate(fits)
+        if size == 0 or _greatest_error(design, rows, fit, size, corners) <= MAX_MODEL_ERROR
+    ]
+    best = min(sizes, key=lambda size: error[size].mean())
+    gap = error - error[best]
+    uncertain = PREFERENCE * gap.std(1) / math.sqrt(len(rows))
+    size = min(size for size in sizes if gap[size].mean() <= uncertain[size])
+    # The fit of no terms is 0 everywhere.
+    if math.sqrt(np.square(design @ fits[size]).mean()) <= CORRECT_ABOVE:
+        return None
+    return RowModel(tuple(map(float, fits[size])), width, height, (*columns, *lines))
+
+
+def _greatest_error(
+    design: np.ndarray, rows: np.ndarray, fit: np.ndarray, size: int, places: np.ndarray
+) -> float:
+    """Standard error, px, of a fit of the first `size` terms, where it is greatest among places."""
+    spread = _TO_SD * float(np.median(np.abs(rows - design @ fit)))
+    places = places[:, :size]
+    return spread * math.sqrt(((places @ _unit_covariance(design[:, :size])) * places).sum(1).max())
+
+
+def _unit_covariance(design: Float[np.ndarray, "num terms"]) -> Float[np.ndarray, "terms terms"]:
+    """Covariance of the coefficients with the least absolute residuals, for residuals of unit spread."""
+    return _MEDIAN_ERROR**2 * np.linalg.pinv(design.T @ design)
+
+
+def _from_middle(place: _Place, size: int, width: int) -> _Place:
+    """A column or a row from the middle of the image's `size` px, in half widths: both are then alike in size."""
+    return (place - (size - 1) / 2) / (width / 2)
+
+
+def _design(
+    u: Float[np.ndarray, " num"], v: Float[np.ndarray, " num"], width: int, height: int
+) -> Float[np.ndarray, "num terms"]:
+    """The five terms at columns and rows, see `RowModel`."""
+    x, y = _from_middle(u, width, width), _from_middle(v, height, width)
+    return np.stack([np.ones_like(x), x, y, x * y, y * y], 1)
+
+
+def _least_absolute(
+    design: Float[np.ndarray, "num terms"],
+    values: Float[np.ndarray, " num"],
+    counted: Bool[np.ndarray, "problems num"],
+    terms: Bool[np.ndarray, "problems terms"],
+) -> Float[np.ndarray, "problems terms"]:
+    """The coefficients with the least sum of absolute residuals, by least squares weighted again and again.
+
+    Many problems at once: the values that count and the terms that may differ from 0 in each.
+    """
+    weight = counted.astype(np.float64)
     for _ in range(30):
-        root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
-        weight = 1 / np.maximum(np.abs(values - design @ coefficients), 1e-3)  # px, below what is measured
+        weighted = weight[:, :, None] * design
+        normal = (weighted.swapaxes(1, 2) @ design) * (terms[:, :, None] & terms[:, None])
+        right = (weighted.swapaxes(1, 2) @ values) * terms
+        coefficients = (np.linalg.pinv(normal, 1e-10, hermitian=True) @ right[..., None])[..., 0]
+        # 1e-3 px is below what is measured.
+        weight = counted / np.maximum(np.abs(values - coefficients @ design.T), 1e-3)
     return coefficients
