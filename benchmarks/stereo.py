@@ -16,8 +16,8 @@ bm       OpenCV's block matcher, 15 x 15
 
 A first table times a full frame of 640 x 480 with 64 disparities. With `--people`, pixels are those of the true
 person, and its region is the mask that the first five are given: alone with all disparities that the room allows,
-and as in a video, with the last frame's answer as seeds and its range and half a metre as range. `arms` are the
-hardest part: bare, thin and of little texture. `--degrade` repeats all with the right image spoilt.
+and as in a video, with the last frame's answer as seeds, and its range and a margin as range, as `Eyes` does it.
+`arms` are the hardest part: bare, thin and of little texture. `--degrade` repeats all with the right image spoilt.
 """
 
 import argparse
@@ -40,6 +40,7 @@ from torch.nn import functional as F
 
 from torchpose.atomic import replacing
 from torchpose.calibration import read_calibration
+from torchpose.pipeline import EyesConfig
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.disparity import Disparity
 from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
@@ -51,7 +52,7 @@ SCENE_RANGE = (0, 63)  # px
 PERSON_RANGE = (8, 64)  # px: 1.4 to 11 m with the recordings' camera
 PERSON_FRAMES = (3, 15, 27, 39, 51)  # of the 60 of a recording; the defaults were chosen on others
 MARGIN = 4  # px of the person's region around the true person
-LAST_MARGIN = 0.5  # m around the last frame's range
+LAST_MARGIN = EyesConfig().last_margin  # m around the last frame's range
 ARMS = ("upper_arm_L", "forearm_L", "upper_arm_R", "forearm_R")
 
 Image = Float[Tensor, "1 3 height width"]

@@ -7,7 +7,7 @@ from stereo_scene import correlation
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from torchpose.vision.disparity_space import GROWTH, DisparitySpace, box_sum, crop_beyond, similarities
+from torchpose.vision.disparity_space import GROWTH, DisparitySpace, box_sums, crop_beyond, similarities
 
 
 def test_similarities_are_their_definition() -> None:
@@ -39,11 +39,14 @@ def test_similarities_end_where_the_right_image_ends() -> None:
     assert torch.equal(volume != 0, ((column >= 0) & (column < 12)).expand_as(volume))
 
 
-@pytest.mark.parametrize("window", [3, 5, 7, 9, 13])
-def test_box_sums_are_pooling(window: int) -> None:
+@pytest.mark.parametrize("windows", [(3,), (5,), (9, 5), (5, 9), (3, 7, 13), (1, 11)])
+def test_box_sums_are_pooling(windows: tuple[int, ...]) -> None:
     image = torch.rand(2, 20, 31, dtype=torch.float64)
-    expected = F.avg_pool2d(image[:, None], window, 1, divisor_override=1)[:, 0]
-    assert_close(box_sum(image, window), expected)
+    sums = box_sums(image, windows)
+    for window, found in zip(windows, sums, strict=True):
+        inner = (max(windows) - window) // 2
+        centred = image[:, inner : 20 - inner, inner : 31 - inner]
+        assert_close(found, F.avg_pool2d(centred[:, None], window, 1, divisor_override=1)[:, 0])
 
 
 def test_steps_lead_to_the_papers_neighbours() -> None:

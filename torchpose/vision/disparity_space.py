@@ -126,18 +126,15 @@ def similarities(
 
     Grey images about 0 (their squares are summed), `mask` of the region, odd `windows` in px.
     """
-    planes = [_Correlation(left, right, mask, space, window, noise) for window in windows]
+    correlation = _Correlation(left, right, mask, space, windows, noise)
     volume = left.new_full((space.batch, space.height + 2, space.layers, space.columns), -1)
     for layer in range(1, space.disparities + 1):
-        total = planes[0].plane(layer)
-        for correlation in planes[1:]:
-            total += correlation.plane(layer)
-        torch.div(total, len(planes), out=volume[:, 1:-1, layer, REACH:-REACH])
+        volume[:, 1:-1, layer, REACH:-REACH] = correlation.plane(layer)
     return volume.flatten()
 
 
 class _Correlation:
-    """Modified normalised cross-correlation of one window size: c = 2 cov / (v_left + v_right).
+    """Modified normalised cross-correlation c = 2 cov / (v_left + v_right), the mean over some window sizes.
 
     By box sums of a whole plane of the region at a time, so a cell costs the same whatever the window.
     `noise`, a grey value's standard deviation, is added to the variances, lest what is flat but for noise
@@ -150,54 +147,99 @@ class _Correlation:
         right: Float[Tensor, "batch height width"],
         mask: Bool[Tensor, "batch h w"],
         space: DisparitySpace,
-        window: int,
+        windows: tuple[int, ...],
         noise: float,
     ) -> None:
-        margin = window // 2
+        margin = max(windows) // 2
         height, width = space.height + 2 * margin, space.width + 2 * margin
         first = space.left - (space.least + space.disparities - 1)  # column that the greatest disparity sees
-        self.window, self.space = window, space
+        self.windows, self.noise, self.space = windows, noise, space
         self.left = crop_beyond(left, space.top - margin, space.left - margin, height, width)
         self.right = crop_beyond(
             right, space.top - margin, first - margin, height, width + space.disparities - 1
         )
-        self.left_sum, left_variance = self._moments(self.left, noise)
-        self.right_sum, right_variance = self._moments(self.right, noise)
+        self.left_sums, left_variances = self._moments(self.left)
+        self.right_sums, right_variances = self._moments(self.right)
         # An infinite variance makes the similarity 0: off the mask and off the right image.
-        column = first + torch.arange(right_variance.shape[-1], device=mask.device)
-        self.left_variance = left_variance.where(mask, torch.inf)
-        self.right_variance = right_variance.where((column >= 0) & (column < right.shape[-1]), torch.inf)
+        column = first + torch.arange(right_variances[0].shape[-1], device=mask.device)
+        inside = (column >= 0) & (column < right.shape[-1])
+        self.left_variances = [variance.where(mask, torch.inf) for variance in left_variances]
+        self.right_variances = [variance.where(inside, torch.inf) for variance in right_variances]
 
     def _moments(
-        self, image: Float[Tensor, "batch h_wide w_wide"], noise: float
-    ) -> tuple[Float[Tensor, "batch h w"], Float[Tensor, "batch h w"]]:
-        """s = sum / sqrt(a), and half of v = (sum of squares) - s^2, of the windows of area a."""
-        total = box_sum(image, self.window) / self.window
-        variance = box_sum(image.square(), self.window) - total.square()
-        return total, 0.5 * variance.clamp(min=0) + 0.5 * (self.window * noise) ** 2
+        self, image: Float[Tensor, "batch h_wide w_wide"]
+    ) -> tuple[list[Float[Tensor, "batch h w"]], list[Float[Tensor, "batch h w"]]]:
+        """For each size, s = sum / sqrt(a), and half of v = (sum of squares) - s^2, of the windows of area a.
+
+        The latter times the number of sizes, so that the correlations add up to their mean.
+        """
+        totals = [
+            total / side for total, side in zip(box_sums(image, self.windows), self.windows, strict=True)
+        ]
+        squares = box_sums(image.square(), self.windows)
+        scale = 0.5 * len(self.windows)
+        variances = [
+            scale * ((square - total.square()).clamp_(min=0) + (side * self.noise) ** 2)
+            for square, total, side in zip(squares, totals, self.windows, strict=True)
+        ]
+        return totals, variances
 
     def plane(self, layer: int) -> Float[Tensor, "batch h w"]:
         """Similarities at one layer, 1 to `disparities`."""
         start = self.space.disparities - layer
         centres = slice(start, start + self.space.width)
-        covariance = box_sum(self.left * self.right[..., start : start + self.left.shape[-1]], self.window)
-        covariance.addcmul_(self.left_sum, self.right_sum[..., centres], value=-1)
-        return covariance.div_(self.left_variance + self.right_variance[..., centres])
+        products = self.left * self.right[..., start : start + self.left.shape[-1]]
+        correlations = []
+        for index, covariance in enumerate(box_sums(products, self.windows)):
+            covariance.addcmul_(self.left_sums[index], self.right_sums[index][..., centres], value=-1)
+            spread = self.left_variances[index] + self.right_variances[index][..., centres]
+            correlations.append(covariance.div_(spread))
+        for other in correlations[1:]:
+            correlations[0] += other
+        return correlations[0]
 
 
-def box_sum(images: Float[Tensor, "batch h w"], window: int) -> Float[Tensor, "batch h_valid w_valid"]:
-    """Sums over the whole windows inside the images, by doubling: ten times as fast as pooling."""
-    for dim in (-2, -1):
-        size = images.shape[dim] - window + 1
-        total, span = images, 1
-        while 2 * span <= window:
-            length = total.shape[dim] - span
-            total = total.narrow(dim, 0, length) + total.narrow(dim, span, length)
-            span *= 2
-        for offset in range(span, window):
-            total = total.narrow(dim, 0, size) + images.narrow(dim, offset, size)
-        images = total
-    return images
+def box_sums(
+    images: Float[Tensor, "batch h w"], windows: tuple[int, ...]
+) -> list[Float[Tensor, "batch h_valid w_valid"]]:
+    """Sums over windows of each odd size, about the centres of the whole windows of the largest inside the images.
+
+    By doubling, ten times as fast as pooling; the sizes share their sums along the rows.
+    """
+    widest = max(windows)
+    height, width = images.shape[1] - widest + 1, images.shape[2] - widest + 1
+    along = _doubled(images, 2, widest)
+    sums = []
+    for window in windows:
+        before = (widest - window) // 2
+        rows = _window_sum(along, 2, window, before, width).narrow(1, before, height + window - 1)
+        sums.append(_window_sum(_doubled(rows, 1, window), 1, window, 0, height))
+    return sums
+
+
+def _doubled(images: Tensor, dim: int, window: int) -> list[Tensor]:
+    """Sums over 1, 2, 4, ... pixels from each on along an axis, as far as they fit into the window."""
+    sums, span = [images], 1
+    while 2 * span <= window:
+        length = sums[-1].shape[dim] - span
+        sums.append(sums[-1].narrow(dim, 0, length) + sums[-1].narrow(dim, span, length))
+        span *= 2
+    return sums
+
+
+def _window_sum(doubled: list[Tensor], dim: int, window: int, start: int, size: int) -> Tensor:
+    """Sums over `window` pixels from `start` on: one span for each one of the window's binary digits."""
+    parts = []
+    for digit in reversed(range(len(doubled))):
+        if window >> digit & 1:
+            parts.append(doubled[digit].narrow(dim, start, size))
+            start += 1 << digit
+    if len(parts) == 1:
+        return parts[0].clone()
+    total = parts[0] + parts[1]
+    for part in parts[2:]:
+        total += part
+    return total
 
 
 def crop_beyond(

@@ -190,8 +190,8 @@ def similar_cells(
 ) -> Int[Tensor, " seeds"]:
     """The most similar cell of each pixel, where that is similar enough for a seed."""
     bottom = space.cell(pixel, torch.ones_like(pixel))
-    along = bottom[:, None] + torch.arange(space.disparities, device=bottom.device) * space.columns
-    best, layer = volume[along].max(dim=1)
+    along = bottom + torch.arange(space.disparities, device=bottom.device)[:, None] * space.columns
+    best, layer = volume.index_select(0, along.flatten()).view(along.shape).max(dim=0)
     good = best >= config.seed_similarity
     return bottom[good] + layer[good] * space.columns
 
@@ -344,6 +344,7 @@ def fill(
     taken.scatter_(0, space.right_pixel(matched, owner), owner)
     hole = space.pad(mask, False) & layers.isnan()
     number = torch.zeros_like(hole, dtype=torch.int32)
+    filled = [matched.new_empty(2, 0)]
     for least in config.fill_levels:
         rim = hole.nonzero()[:, 0]
         while len(rim):
@@ -360,12 +361,8 @@ def fill(
             free = (other < 0) | ((other - layer).abs() <= config.tolerance)
             accepted = (free & (value >= least)).nonzero()[:, 0]
             pixel, layer, value, mean = (x.index_select(0, accepted) for x in (rim, layer, value, mean))
-            cell = space.cell(pixel, layer)
-            peak = value >= torch.maximum(
-                volume.index_select(0, cell - across), volume.index_select(0, cell + across)
-            )
-            settled = torch.maximum(torch.minimum(mean, layer + 0.5), layer - 0.5)
-            layers.scatter_(0, pixel, torch.where(peak, _sub_pixel(volume, cell, layer, space), settled))
+            layers.scatter_(0, pixel, torch.maximum(torch.minimum(mean, layer + 0.5), layer - 0.5))
+            filled.append(torch.stack([pixel, layer]))
             similarity.scatter_(0, pixel, 0.5 * value)
             hole.index_fill_(0, pixel, False)
             rim = (pixel + side).flatten()
@@ -374,4 +371,11 @@ def fill(
             order = torch.arange(len(rim), dtype=torch.int32, device=rim.device)
             number.scatter_(0, rim, order)
             rim = rim.index_select(0, (number.index_select(0, rim) == order).nonzero()[:, 0])
+    # What peaks at its layer was measured there, the rest keeps to its neighbours.
+    pixel, layer = torch.cat(filled, dim=1)
+    cell = space.cell(pixel, layer)
+    below, here, above = (volume.index_select(0, cell + step) for step in (-across, 0, across))
+    peak = (here >= torch.maximum(below, above)).nonzero()[:, 0]
+    pixel, layer, cell = (x.index_select(0, peak) for x in (pixel, layer, cell))
+    layers.scatter_(0, pixel, _sub_pixel(volume, cell, layer, space))
     return layers, similarity
