@@ -31,7 +31,7 @@ def config_of(radius: Radius) -> SemiGlobalConfig:
 
 
 def census_by_loop(grey: np.ndarray, y: int, x: int, radius: Radius) -> list[bool]:
-    """Whether each neighbour of a pixel, row by row, is brighter than it by the noise; beyond the image its edge repeats."""
+    """Whether each neighbour of a pixel, row by row, is brighter by the noise; beyond the image its edge repeats."""
     height, width = grey.shape
     return [
         bool(grey[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)] > grey[y, x] + NOISE)
