@@ -241,7 +241,7 @@ class Session:
             "point_to_model_m": {
                 "mean": float(sequence.point_to_model.nanmean()),
                 "sd": float(np.nanstd(sequence.point_to_model.numpy()))
-                if any(sequence.answered)
+                if bool(sequence.point_to_model.isfinite().any())
                 else float("nan"),
             },
             "size": lengths,
