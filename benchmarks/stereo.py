@@ -135,7 +135,7 @@ MATCHERS: dict[str, Matcher] = {
     "hh4": hh4,
     "bm": block_matching,
 }
-REGIONAL = ("gcs", "sgm", "sgbm")  # take the person's region and the last frame's range
+REGIONAL = ("gcs", "paper", "sgm", "sgbm")  # take the person's region and the last frame's range
 
 
 def shifted(image: Image, rows: float) -> Image:
