@@ -78,7 +78,7 @@ class EyesConfig:
     face: FaceConfig = field(default_factory=FaceConfig)
     range_scale: int = 4  # by which images are shrunk to find the person's range of disparities
     glance_margin: float = 0.8  # m around it: an arm may be too thin for the small images
-    last_margin: float = 0.4  # m around the last frame's range
+    last_margin: float = 0.5  # m around the last frame's range
     least_matched: float = 0.7  # share of the foreground; with less the range was wrong, and all is searched
     min_points: int = 60  # fewer points on the person are nobody
 
