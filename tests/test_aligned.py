@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,11 +116,21 @@ def depth_camera() -> Fixed:
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: recording(0), without_texture, depth_camera], ids=["good rows", "bare", "depth camera"]
+    ("make", "measured"),
+    [(lambda: recording(0), 1), (without_texture, 1), (depth_camera, 0)],
+    ids=["good rows", "bare", "depth camera"],
 )
-def test_where_nothing_is_gained_the_recording_is_returned_itself(make):
+def test_where_nothing_is_gained_the_recording_is_returned_itself_and_soon(
+    make: Callable[[], Fixed], measured: int, monkeypatch: pytest.MonkeyPatch
+):
+    calls = []
+    monkeypatch.setattr(
+        aligned, "measure_alignment", lambda *images: calls.append(images) or measure_alignment(*images)
+    )
     original = make()
     assert align_recording(original) is original
+    assert len(calls) == measured
+    assert bool(original.read) == bool(measured)
 
 
 def test_a_recording_that_cannot_be_read_is_returned_itself(monkeypatch: pytest.MonkeyPatch):

@@ -365,12 +365,57 @@ def test_where_no_match_lies_the_correction_stays_what_it_is_at_the_last():
     left[..., 240:], spoilt[..., 240:] = 0.5, 0.5
     model = measure_alignment(left, spoilt).model
     assert model is not None
-    assert 200 < model.box[1] < 240 + 0.1 * 480
+    assert 235 < model.box[1] < 240 + 0.1 * 480
     pixels = torch.tensor([[model.box[1], 150.0], [479.0, 150.0], [100.0, 150.0]])
     rows = (model.place(pixels) - pixels)[:, 1]
     assert rows[0] == pytest.approx(rows[1])
     assert rows[1] < 0.008 * 50
     assert rows[2] == pytest.approx(0.008 * (100 - 239.5), abs=0.15)
+
+
+def row_model(u: np.ndarray, v: np.ndarray, rows: np.ndarray) -> RowModel | None:
+    """Of matches at a right column and a left row, and how much lower they lie in the right image."""
+    return alignment._row_model(np.stack([u + 20, v, u, v + rows], 1), 640, 480)
+
+
+def test_places_are_the_right_image_s_columns_and_the_left_s_rows():
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(20, 580, 300), rng.uniform(20, 460, 300)
+    rows = 9 + 12 * (u - 319.5) / 320 - 60 * (v - 239.5) / 320
+    model = row_model(u, v, rows)
+    assert model is not None
+    assert model.coefficients == pytest.approx((9, 12, -60, 0, 0), abs=1e-6)
+
+
+def test_errors_that_a_tile_of_the_image_has_in_common_are_not_fitted():
+    """20 matches in each of 30 tiles share the tile's error: they tell no more than 30 matches, and no bend."""
+    rng = np.random.default_rng(0)
+    sizes = []
+    for _ in range(12):
+        tile = rng.permutation(80)[:30].repeat(20)
+        u, v = (
+            ((tile % 10) + rng.uniform(0.05, 0.9, 600)) * 64 - 20,
+            (tile // 10 + rng.uniform(0, 1, 600)) * 60,
+        )
+        rows = 1 + 0.5 * rng.standard_normal(80)[tile] + 0.05 * rng.standard_normal(600)
+        model = row_model(u, v, rows)
+        assert model is not None
+        sizes.append(np.count_nonzero(model.coefficients))
+    assert np.mean(sizes) < 2
+
+
+def test_a_bend_is_not_carried_into_corners_without_matches():
+    """Along a diagonal of the image columns and rows bend alike; what the other corners do, no match tells."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-0.7, 0.7, 200)
+    y = x + rng.uniform(-0.02, 0.02, 200)
+    rows = 0.5 + 4 * x * y + 0.3 * rng.standard_normal(200)
+    model = row_model(x * 320 + 319.5, y * 320 + 239.5, rows)
+    assert model is not None
+    assert not any(model.coefficients[2:])
+    for sign in (-1, 1):
+        corner = torch.tensor([319.5 + sign * 220, 239.5 - sign * 220])
+        assert (model.place(corner) - corner).abs().max() < rows.max()
 
 
 def test_a_few_matches_carry_no_bend():
@@ -380,12 +425,12 @@ def test_a_few_matches_carry_no_bend():
         u, v = rng.uniform(40, 600, 24), rng.uniform(40, 440, 24)
         x, y = (u - 319.5) / 320, (v - 239.5) / 320
         rows = 2 + 3 * x * y + 0.8 * rng.standard_normal(24)
-        few = alignment._row_model(np.stack([u + 20, v, u, v + rows], 1), 640, 480)
+        few = row_model(u, v, rows)
         assert few is not None
         assert not any(few.coefficients[2:])
     many = [np.tile(value, 40) for value in (u, v, x * y)]
     rows = 2 + 3 * many[2] + 0.8 * rng.standard_normal(960)
-    model = alignment._row_model(np.stack([many[0] + 20, many[1], many[0], many[1] + rows], 1), 640, 480)
+    model = row_model(many[0], many[1], rows)
     assert model is not None
     assert model.coefficients[3] == pytest.approx(3, abs=0.3)
 
