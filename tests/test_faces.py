@@ -7,7 +7,8 @@ import torch
 from torch.testing import assert_close
 
 from torchpose.vision.camera import StereoCamera
-from torchpose.vision.faces import FaceConfig, FaceDetector
+from torchpose.vision.faces import FaceConfig, FaceDetector, FaceMemory
+from torchpose.vision.skin import fade_skin, skin_prior, skin_probability
 
 CAMERA = StereoCamera(512, 512, 690.0, 250.0, 260.0, 0.12)
 FACE = (175.0, 65.0, 275.0, 180.0)  # of the astronaut: x0, y0, x1, y1 from the hairline to the chin
@@ -31,9 +32,12 @@ def within(box, region):
 
 
 @pytest.mark.parametrize("brightness", [1.0, 0.5, 0.3])
-def test_a_face_is_found_in_light_and_in_shade(brightness):
+@pytest.mark.parametrize("tint", [(1.0, 1.0, 1.0), (1.15, 0.9, 0.6), (0.92, 1.0, 1.08), (0.7, 0.58, 0.5)])
+def test_a_face_is_found_in_light_and_in_shade(brightness, tint):
+    """White, warm and cool light, and darker skin."""
     mask, depth = upper_body()
-    faces = FaceDetector()(brightness * astronaut(), mask, depth, CAMERA)
+    image = (brightness * torch.tensor(tint)[:, None, None] * astronaut()).clamp(0, 1)
+    faces = FaceDetector()(image, mask, depth, CAMERA)
     assert faces.found.tolist() == [True]
     box = faces.box[0]
     assert within(box, (205, 90, 245, 150))
@@ -68,6 +72,73 @@ def test_without_depth_the_silhouettes_height_stands_in_and_there_is_no_position
     assert faces.found.tolist() == [True]
     assert within(faces.box[0], FACE)
     assert faces.position.isnan().all()
+
+
+def test_a_camera_without_colours_sees_a_face():
+    mask, depth = upper_body()
+    grey = astronaut().mean(1, keepdim=True).expand(-1, 3, -1, -1)
+    faces = FaceDetector()(grey, mask, depth, CAMERA)
+    assert within(faces.box[0], FACE)
+    prior = skin_prior(grey)
+    assert_close(faces.memory.skin.mean, prior.mean, atol=0.01, rtol=0)  # grey is not learned as skin
+
+
+def test_the_persons_own_skin_is_learned_and_tells_where_the_skin_is():
+    image, (mask, depth) = astronaut(), upper_body()
+    detector, last = FaceDetector(), None
+    for _ in range(10):
+        last = detector(image, mask, depth, CAMERA, last).memory
+    prior = skin_prior(image)
+    assert last.skin.covariance.det() < 0.2 * prior.covariance.det()
+    before, after = skin_probability(image, prior)[0] > 0.5, skin_probability(image, last.skin)[0] > 0.5
+    face, suit = (slice(90, 160), slice(200, 250)), (slice(300, 420), slice(60, 200))  # orange
+    assert after[face].float().mean() > 0.8
+    assert after[suit].float().mean() < 0.5 * before[suit].float().mean()
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (90, 0), (-120, 0), (0, 150)])
+def test_where_the_last_face_was_only_tells_where_to_look_first(shift):
+    mask, depth = upper_body()
+    detector = FaceDetector()
+    alone = detector(astronaut(), mask, depth, CAMERA)
+    moved = alone.memory.box + torch.tensor([shift * 2], dtype=torch.float32)
+    again = detector(astronaut(), mask, depth, CAMERA, FaceMemory(moved, skin_prior(astronaut())))
+    assert again.found.tolist() == [True]
+    assert_close(again.box, alone.box, atol=12, rtol=0)
+
+
+def test_a_lost_face_is_forgotten_and_the_skin_fades():
+    image, (mask, depth) = astronaut(), upper_body()
+    detector = FaceDetector()
+    seen = detector(image, mask, depth, CAMERA).memory
+    lost = detector(image, torch.zeros_like(mask), depth, CAMERA, seen).memory
+    assert lost.box.isnan().all()
+    faded = fade_skin(seen.skin)
+    for name in ("weight", "total", "square"):
+        assert_close(getattr(lost.skin, name), getattr(faded, name))
+
+
+def disc(height, width, centre=(20.0, 20.0)):
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
+    return ((y - centre[0]) / height) ** 2 + ((x - centre[1]) / width) ** 2 <= 1
+
+
+@pytest.mark.parametrize(
+    ("patch", "face"),
+    [
+        (disc(18, 14), True),
+        (disc(18, 14) & ~disc(3, 5, (15, 13)) & ~disc(3, 5, (15, 27)), True),  # eyes
+        (disc(18, 5), False),  # an arm
+        (disc(6, 18), False),  # a belt
+        (disc(6, 6), False),  # a button
+        (disc(18, 18) & ~disc(15, 15), False),  # the rim of a hood
+        ((torch.arange(40) % 4 < 2) & disc(19, 19), False),  # stripes
+        (torch.zeros(40, 40, dtype=torch.bool), False),
+    ],
+)
+def test_a_patch_of_skin_must_have_a_faces_shape(patch, face):
+    """Of a box of 40 px, whose ellipse has 1257."""
+    assert FaceDetector()._skin_shaped(patch, 1257) is face
 
 
 def blue(image, mask, depth):
@@ -132,12 +203,15 @@ def test_batch_equals_one_by_one():
     images = torch.cat([astronaut(), astronaut().flip(1), astronaut().flip(3)])
     masks, depths = torch.cat([mask, mask, mask.flip(2)]), torch.cat([depth, depth, 1.1 * depth.flip(2)])
     detector = FaceDetector()
-    together = detector(images, masks, depths, CAMERA)
+    last = detector(images, masks, depths, CAMERA).memory
+    together = detector(images, masks, depths, CAMERA, last)
     assert together.found.tolist() == [True, False, True]
     for k in range(3):
-        alone = detector(images[k : k + 1], masks[k : k + 1], depths[k : k + 1], CAMERA)
+        memory = FaceMemory(last.box[k : k + 1], last.skin.item(k))
+        alone = detector(images[k : k + 1], masks[k : k + 1], depths[k : k + 1], CAMERA, memory)
         for name in ("box", "found", "mask", "position"):
             assert_close(getattr(together, name)[k : k + 1], getattr(alone, name), equal_nan=True)
+        assert_close(together.memory.skin.item(k).total, alone.memory.skin.total)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +221,18 @@ def test_batch_equals_one_by_one():
         (lambda: FaceConfig(scale_step=1.0), "scale_step"),
         (lambda: FaceConfig(face_pixels=10), "face_pixels"),
         (lambda: FaceConfig(search_height=0.0), "search_height"),
+        (lambda: FaceConfig(search_margin=-1.0), "search_margin"),
         (lambda: FaceConfig(min_skin=1.5), "min_skin"),
+        (lambda: FaceConfig(min_aspect=3.0), "min_aspect must be positive and below max_aspect"),
+        (
+            lambda: FaceDetector()(
+                astronaut(),
+                *upper_body(),
+                CAMERA,
+                FaceMemory(torch.zeros(2, 4), skin_prior(astronaut(), batch=2)),
+            ),
+            "memory must be of 1 faces, got 2",
+        ),
         (
             lambda: FaceDetector()(astronaut(), upper_body()[0][:, :100], upper_body()[1], CAMERA),
             "images' size",

@@ -29,6 +29,7 @@ from torchpose.vision.windows import window_max, window_min
 
 STANDING_HEIGHT = 1.7  # m, tells the distance where depth does not
 COARSE = 4  # px, step at which the silhouette is searched for a head
+LIT = 0.5  # brightness that the brightest tenth of a person has at least, where faces are looked for
 COLOURLESS = 0.02  # greatest difference of red and blue where the camera has no colours
 
 Box = tuple[float, float, float, float]  # px, x0, y0, x1, y1
@@ -66,7 +67,7 @@ class FaceConfig:
     search_margin: float = 0.15  # m about the last frame's face, where this one is looked for first
     min_inside: float = 0.75  # share of the face that must lie on the silhouette
     min_skin: float = 0.4  # share of that which must be one patch of skin
-    min_fill: float = 0.5  # share of the rectangle about the patch that it fills; a face is round
+    min_fill: float = 0.4  # share of the rectangle about the patch that it fills; a face is round
     min_aspect: float = 0.7  # height to width of that rectangle
     max_aspect: float = 2.2
     skin: SkinConfig = field(default_factory=SkinConfig)
@@ -232,11 +233,16 @@ class FaceDetector:
 
     def _search_window(self, scene: _Scene, window: tuple[slice, slice]) -> Box | None:
         """The face that most overlapping detections agree on: frontal ones, then profiles."""
+        if not scene.silhouette[window].any():
+            return None
         y0, x0 = window[0].start, window[1].start
         colours = scene.image[:, :, *window]
         coloured = float((colours[:, 0] - colours[:, 2]).abs().amax()) > COLOURLESS
-        brightness = (255 * kornia.color.rgb_to_grayscale(colours)[0, 0]).round().clamp(0, 255)
-        grey = brightness.byte().cpu().numpy()
+        brightness = kornia.color.rgb_to_grayscale(colours)[0, 0]
+        # In bytes, as OpenCV wants it, too little contrast is left of a dark face.
+        bright = float(brightness[scene.silhouette[window]].quantile(0.9))
+        gain = max(1.0, LIT / max(bright, LIT / 10))
+        grey = (255 * gain * brightness).round().clamp(0, 255).byte().cpu().numpy()
         for kind, cascade in self._cascades:
             metre = kind.box * scene.metre  # px, of a box about a face of 1 m
             scale = self.config.face_pixels / (self.config.min_width * metre)
