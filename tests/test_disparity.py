@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchpose.vision.disparity import bridge_gaps, smooth, without_islands
+from torchpose.vision.disparity import bounding_box, bridge_gaps, smooth, without_islands
 
 
 def random_disparity(*shape: int, spread: float = 3.0, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -142,3 +142,16 @@ def test_a_plane_is_bridged_exactly_and_a_step_is_not() -> None:
     assert_close(bridge_gaps(step), step, equal_nan=True)
     nothing = torch.full((4, 6), torch.nan)
     assert bridge_gaps(nothing).isnan().all()
+
+
+def test_a_bounding_box_holds_all_masks_and_touches_them() -> None:
+    for _ in range(20):
+        mask = torch.rand(3, 9, 14) < 0.02
+        mask[1, 4, 6] = True
+        rows, columns = bounding_box(mask)
+        assert mask[:, rows, columns].sum() == mask.sum()
+        inside = mask[:, rows, columns].any(0)
+        assert inside[0].any()
+        assert inside[-1].any()
+        assert inside[:, 0].any()
+        assert inside[:, -1].any()

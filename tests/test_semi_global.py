@@ -9,6 +9,7 @@ from stereo_scene import plane
 from torch import Tensor
 from torch.testing import assert_close
 
+from torchpose.vision.disparity import MatchingTask
 from torchpose.vision.semi_global import (
     SemiGlobal,
     SemiGlobalConfig,
@@ -83,8 +84,10 @@ def test_a_cost_is_the_bits_that_differ(
     """All of them where the right image ends, none off the mask, and edges repeat: images 9 x 17 px, odd boxes."""
     left, right = few_greys(2, 9, 17), few_greys(2, 9, 17)
     rows, columns = box
-    region = (torch.rand(2, 9, 17) < 0.8)[:, rows, columns]
-    cost = matching_cost(left, right, region, rows, columns, least, greatest, config_of(radius))
+    mask = torch.rand(2, 9, 17) < 0.8
+    region = mask[:, rows, columns]
+    task = MatchingTask(left, right, mask, None, least, greatest)
+    cost = matching_cost(task, rows, columns, config_of(radius))
     assert cost.shape == (region.shape[1], 2, greatest - least + 1, region.shape[2])
     bits = (2 * radius[0] + 1) * (2 * radius[1] + 1) - 1
     expected = np.zeros(cost.shape, dtype=np.uint8)

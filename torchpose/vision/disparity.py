@@ -22,6 +22,22 @@ class Disparity:
     confidence: Float[Tensor, "batch height width"]  # in [0, 1], 0 where NaN; its scale is the matcher's own
 
 
+@dataclass(frozen=True)
+class MatchingTask:
+    """What there is to match, checked and complete: grey pairs, and at least one pixel of their masks."""
+
+    left: Grey
+    right: Grey
+    mask: Bool[Tensor, "batch height width"]  # left pixels to match
+    seeds: Grey | None  # px, known beforehand; NaN for none
+    least: int  # px, the disparities to search
+    greatest: int
+
+    def unanswered(self) -> Disparity:
+        """No disparity anywhere, to be filled in."""
+        return Disparity(torch.full_like(self.left, torch.nan), torch.zeros_like(self.left))
+
+
 class StereoMatcher(nn.Module):
     """The interface of the matchers, and the checks that they share; a matcher fills in `match`."""
 
@@ -53,21 +69,18 @@ class StereoMatcher(nn.Module):
         grey = rgb_to_grayscale(left)[:, 0]
         if mask is None:
             mask = torch.ones_like(grey, dtype=torch.bool)
-        if not mask.any():
-            return Disparity(torch.full_like(grey, torch.nan), torch.zeros_like(grey))
-        return self.match(grey, rgb_to_grayscale(right)[:, 0], mask, seeds, least, greatest)
+        task = MatchingTask(grey, rgb_to_grayscale(right)[:, 0], mask, seeds, least, greatest)
+        return self.match(task) if mask.any() else task.unanswered()
 
-    def match(
-        self,
-        left: Grey,
-        right: Grey,
-        mask: Bool[Tensor, "batch height width"],
-        seeds: Grey | None,
-        least: int,
-        greatest: int,
-    ) -> Disparity:
-        """Disparities `least` to `greatest` of grey pairs at the mask's pixels, of which there is one at least."""
+    def match(self, task: MatchingTask) -> Disparity:
+        """The disparities of a task."""
         raise NotImplementedError
+
+
+def bounding_box(mask: Bool[Tensor, "batch height width"]) -> tuple[slice, slice]:
+    """Rows and columns that hold all of the masks' pixels, of which there is one at least."""
+    rows, columns = mask.any(2).any(0).nonzero()[:, 0], mask.any(1).any(0).nonzero()[:, 0]
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def without_islands(disparity: Grey, area: int) -> Grey:

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchpose.vision.disparity import bounding_box
+
 # GCS, step 4: the neighbours (dx_left, dx_right, dy) of a cell, in four sets of which each offers its best.
 GROWTH = (
     ((-1, -1, 0), (-2, -1, 0), (-1, -2, 0)),
@@ -41,10 +43,9 @@ class DisparitySpace:
     @classmethod
     def around(cls, mask: Bool[Tensor, "batch height width"], least: int, greatest: int) -> "DisparitySpace":
         """The space over the bounding box of all the masks."""
-        rows, columns = mask.any(2).any(0).nonzero()[:, 0], mask.any(1).any(0).nonzero()[:, 0]
-        top, left = int(rows[0]), int(columns[0])
-        height, width = int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left
-        return cls(mask.shape[0], top, left, height, width, least, greatest - least + 1)
+        rows, columns = bounding_box(mask)
+        height, width = rows.stop - rows.start, columns.stop - columns.start
+        return cls(mask.shape[0], rows.start, columns.start, height, width, least, greatest - least + 1)
 
     @property
     def layers(self) -> int:

@@ -11,7 +11,7 @@ from kornia.feature import harris_response
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchpose.vision.disparity import Disparity, Grey, StereoMatcher, smooth, without_islands
+from torchpose.vision.disparity import Disparity, MatchingTask, StereoMatcher, smooth, without_islands
 from torchpose.vision.disparity_space import DisparitySpace, crop_beyond, similarities
 
 HARRIS_REACH = 6  # px that a Harris maximum sees: gradient, blur and the comparison with its neighbours
@@ -93,36 +93,27 @@ class GrowingSeeds(StereoMatcher):
         super().__init__()
         self.config = config
 
-    def match(
-        self,
-        left: Grey,
-        right: Grey,
-        mask: Bool[Tensor, "batch height width"],
-        seeds: Grey | None,
-        least: int,
-        greatest: int,
-    ) -> Disparity:
-        config = self.config
-        values, confidence = torch.full_like(left, torch.nan), torch.zeros_like(left)
-        space = DisparitySpace.around(mask, least, greatest)
-        mask = space.crop(mask)
+    def match(self, task: MatchingTask) -> Disparity:
+        config, answer = self.config, task.unanswered()
+        space = DisparitySpace.around(task.mask, task.least, task.greatest)
+        mask = space.crop(task.mask)
         # The correlation is blind to a constant, and sums of squares lose less precision without one.
-        middle = left.mean(dim=(1, 2), keepdim=True)
-        left, right = left - middle, right - middle
+        middle = task.left.mean(dim=(1, 2), keepdim=True)
+        left, right = task.left - middle, task.right - middle
         volume = similarities(left, right, mask, space, tuple(config.windows), config.noise)
-        if seeds is None:
+        if task.seeds is None:
             cells = corner_seeds(volume, left, mask, space, config)
         else:
-            cells = given_seeds(volume, space.crop(seeds), mask, space, config)
+            cells = given_seeds(volume, space.crop(task.seeds), mask, space, config)
         layers, similarity = confident_matches(volume, grow(volume, cells, space, config), space, config)
         found = without_islands(space.unpad(layers), config.min_island)
         if config.fill:
             layers, similarity = fill(volume, space.pad(found, torch.nan), similarity, mask, space, config)
             found = space.unpad(layers)
         found = smooth(found, config.smoothing)
-        space.crop(values).copy_(found + (space.least - 1))
-        space.crop(confidence).copy_(space.unpad(similarity).clamp(0, 1).where(~found.isnan(), 0))
-        return Disparity(values, confidence)
+        space.crop(answer.values).copy_(found + (space.least - 1))
+        space.crop(answer.confidence).copy_(space.unpad(similarity).clamp(0, 1).where(~found.isnan(), 0))
+        return answer
 
 
 def corner_seeds(

@@ -12,7 +12,15 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from torchpose.vision.disparity import Disparity, Grey, StereoMatcher, smooth, without_islands
+from torchpose.vision.disparity import (
+    Disparity,
+    Grey,
+    MatchingTask,
+    StereoMatcher,
+    bounding_box,
+    smooth,
+    without_islands,
+)
 from torchpose.vision.disparity_space import crop_beyond
 
 PATHS = 4  # from the left, the right, above and below
@@ -91,66 +99,50 @@ class SemiGlobal(StereoMatcher):
         super().__init__()
         self.config = config
 
-    def match(
-        self,
-        left: Grey,
-        right: Grey,
-        mask: Bool[Tensor, "batch height width"],
-        seeds: Grey | None,
-        least: int,
-        greatest: int,
-    ) -> Disparity:
+    def match(self, task: MatchingTask) -> Disparity:
         """As `StereoMatcher.match`. Raises ValueError for more disparities than a byte's sum can number."""
-        if greatest - least + 1 > MOST_LAYERS:
+        if task.greatest - task.least + 1 > MOST_LAYERS:
             raise ValueError(
-                f"semi-global matching takes at most {MOST_LAYERS} disparities, got {least} to {greatest} px; "
-                "raise the nearest depth or shrink the images"
+                f"semi-global matching takes at most {MOST_LAYERS} disparities, got {task.least} to "
+                f"{task.greatest} px; raise the nearest depth or shrink the images"
             )
-        rows, columns = _extent(mask.any(2).any(0)), _extent(mask.any(1).any(0))
-        values, confidence = torch.full_like(left, torch.nan), torch.zeros_like(left)
-        region = mask[:, rows, columns]
-        cost = matching_cost(left, right, region, rows, columns, least, greatest, self.config)
-        total = aggregate(cost, left[:, rows, columns].where(region, 0), self.config)
+        answer, (rows, columns) = task.unanswered(), bounding_box(task.mask)
+        region = task.mask[:, rows, columns]
+        cost = matching_cost(task, rows, columns, self.config)
+        total = aggregate(cost, task.left[:, rows, columns].where(region, 0), self.config)
         # A right pixel lies in the image if its column does: column >= layer + least, and the same at the other end.
-        reach = (columns.start - least, right.shape[2] - 1 - columns.start + least)
-        found, margin = winners(total, region, reach, self.config)
+        before = columns.start - task.least
+        found, margin = winners(total, region, (before, task.right.shape[2] - 1 - before), self.config)
         found = smooth(without_islands(found, self.config.min_island), self.config.smoothing)
-        values[:, rows, columns] = found + least
-        confidence[:, rows, columns] = margin.where(~found.isnan(), 0).to(confidence)
-        return Disparity(values, confidence)
+        answer.values[:, rows, columns] = found + task.least
+        answer.confidence[:, rows, columns] = margin.where(~found.isnan(), 0).to(answer.confidence)
+        return answer
 
 
-def matching_cost(
-    left: Grey,
-    right: Grey,
-    region: Bool[Tensor, "batch h w"],
-    rows: slice,
-    columns: slice,
-    least: int,
-    greatest: int,
-    config: SemiGlobalConfig,
-) -> Volume:
-    """Bits in which the census transforms differ: all of them beyond the right image, none off the region's mask."""
+def matching_cost(task: MatchingTask, rows: slice, columns: slice, config: SemiGlobalConfig) -> Volume:
+    """Bits in which the census transforms of a region differ: all beyond the right image, none off the mask."""
+    region = task.mask[:, rows, columns]
     count, height, width = region.shape
     up, across = config.radius
     wide = -(-width // WORD) * WORD
     top, first = rows.start, columns.start
     high, beyond = height + 2 * up, wide + 2 * across
-    ours = census(crop_beyond(left, top - up, first - across, high, beyond), config)
+    ours = census(crop_beyond(task.left, top - up, first - across, high, beyond), config)
     # The right image from the column that the greatest disparity sees.
-    start = first - greatest
-    theirs = census(crop_beyond(right, top - up, start - across, high, beyond + greatest - least), config)
+    layers = task.greatest - task.least + 1
+    start = first - task.greatest
+    theirs = census(crop_beyond(task.right, top - up, start - across, high, beyond + layers - 1), config)
     differ, spare = torch.empty_like(ours), torch.empty_like(ours)
     counted = region.to(torch.uint8)
-    cost = counted.new_empty(height, count, greatest - least + 1, width)
-    for layer in range(cost.shape[2]):
-        shift = greatest - least - layer
+    cost = counted.new_empty(height, count, layers, width)
+    for layer in range(layers):
+        shift = layers - 1 - layer
         torch.bitwise_xor(ours, theirs[..., shift : shift + wide], out=differ)
         count_bits(differ, spare)
         plane = differ.sum(0, dtype=torch.uint8)[..., :width]
         seen = start + shift  # column of the right image that the region's first sees
         plane[..., : max(0, -seen)] = config.bits
-        plane[..., max(0, right.shape[2] - seen) :] = config.bits
+        plane[..., max(0, task.right.shape[2] - seen) :] = config.bits
         torch.mul(plane, counted, out=cost[:, :, layer].transpose(0, 1))
     return cost
 
@@ -279,8 +271,3 @@ def winners(
     found = torch.where(agreed, layer + shift.where(inner, 0), torch.nan)
     margin = (second - here) / (second + config.bits)
     return found.transpose(0, 1), margin.clamp_min(0).transpose(0, 1)
-
-
-def _extent(wanted: Bool[Tensor, " size"]) -> slice:
-    index = wanted.nonzero()[:, 0]
-    return slice(int(index[0]), int(index[-1]) + 1)

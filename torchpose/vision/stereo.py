@@ -6,10 +6,9 @@ from enum import Enum
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
-from torchpose.vision.disparity import Disparity, Grey, StereoMatcher, smooth
+from torchpose.vision.disparity import Disparity, MatchingTask, StereoMatcher, bounding_box, smooth
 from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
 from torchpose.vision.semi_global import SemiGlobal, SemiGlobalConfig
 
@@ -47,17 +46,9 @@ class OpenCVMatcher(StereoMatcher):
         super().__init__()
         self.config = config
 
-    def match(
-        self,
-        left: Grey,
-        right: Grey,
-        mask: Bool[Tensor, "batch height width"],
-        seeds: Grey | None,
-        least: int,
-        greatest: int,
-    ) -> Disparity:
-        config = self.config
-        count = -(-(greatest - least + 1) // 16) * 16
+    def match(self, task: MatchingTask) -> Disparity:
+        config, least = self.config, task.least
+        count = -(-(task.greatest - least + 1) // 16) * 16  # as OpenCV wants it
         area = config.block_size**2
         matcher = cv2.StereoSGBM.create(
             minDisparity=least,
@@ -71,23 +62,23 @@ class OpenCVMatcher(StereoMatcher):
             speckleRange=config.speckle_range,
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
-        values = torch.full_like(left, torch.nan)
-        for index, pair in enumerate(zip(left, right, strict=True)):
-            rows, columns = mask[index].any(1).nonzero()[:, 0], mask[index].any(0).nonzero()[:, 0]
-            if len(rows) == 0:
+        values = task.unanswered().values
+        for index in range(len(values)):  # OpenCV takes one pair at a time
+            mask = task.mask[index : index + 1]
+            if not mask.any():
                 continue
-            above, below = int(rows[0]), int(rows[-1]) + 1
+            rows, columns = bounding_box(mask)
             # OpenCV answers nothing in the first columns, for which the right image may not reach.
-            start = max(0, int(columns[0]) - max(0, least + count))
-            end = min(left.shape[2], int(columns[-1]) + 1 - min(least, 0))
+            start = max(0, columns.start - max(0, least + count))
+            end = min(values.shape[2], columns.stop - min(least, 0))
             if end - start + min(least, 0) <= max(0, least + count):
                 continue
-            images = [_eight_bit(image[above:below, start:end]) for image in pair]
-            found = torch.from_numpy(matcher.compute(*images).astype(np.float32) / 16).to(left)
-            found = found.where((found >= least) & (found <= greatest), torch.nan)
-            values[index, above:below, start:end] = found
-        values = smooth(values.where(mask, torch.nan), config.smoothing)
-        return Disparity(values, (~values.isnan()).to(left.dtype))
+            images = [_eight_bit(image[index, rows, start:end]) for image in (task.left, task.right)]
+            found = torch.from_numpy(matcher.compute(*images).astype(np.float32) / 16).to(values)
+            found = found.where((found >= least) & (found <= task.greatest), torch.nan)
+            values[index, rows, start:end] = found
+        values = smooth(values.where(task.mask, torch.nan), config.smoothing)
+        return Disparity(values, (~values.isnan()).to(values.dtype))
 
 
 @dataclass(frozen=True)
