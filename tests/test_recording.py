@@ -18,6 +18,8 @@ from torchpose.recording import (
     Recording,
     UnreadableFrame,
     open_recording,
+    readable_frames,
+    spread_positions,
     write_recording,
 )
 from torchpose.vision.camera import RawStereo, StereoCamera
@@ -156,6 +158,27 @@ def test_a_bad_frame_in_the_middle_says_so_and_leaves_the_others(stereo: Path, u
         recording[1]
     assert (error.value.index, error.value.time_s) == (4, 0.4)
     assert [recording[position].index for position in (0, 2)] == [3, 10]
+
+
+@pytest.mark.parametrize(
+    ("length", "count", "positions"),
+    [
+        (10, 4, [0, 3, 6, 9]),
+        (100, 3, [0, 50, 99]),  # halves go to the even number
+        (5, 5, [0, 1, 2, 3, 4]),
+        (3, 6, [0, 1, 2]),
+        (7, 1, [0]),
+        (1, 3, [0]),
+        (0, 3, []),
+    ],
+)
+def test_positions_are_spread_from_end_to_end(length: int, count: int, positions: list[int]):
+    assert spread_positions(length, count) == positions
+
+
+def test_frames_that_cannot_be_read_are_passed_over(stereo: Path):
+    (stereo / "left" / "000004.png").write_text("not an image")
+    assert [frame.index for frame in readable_frames(open_recording(stereo), [2, 1, 0])] == [10, 3]
 
 
 def test_the_first_image_may_be_bad_but_not_all(stereo: Path):

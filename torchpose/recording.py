@@ -302,19 +302,13 @@ def open_recording(
 
 def _with_focal_length(recording: FolderRecording, height: float) -> FolderRecording:
     """The recording by a camera whose focal length is estimated from a person who is `height` m tall."""
-    frames = []
-    for position in (
-        np.linspace(0, len(recording) - 1, min(len(recording), _PERSON_FRAMES)).round().astype(int)
-    ):
-        try:
-            frames.append(recording[int(position)].depth)
-        except UnreadableFrame:
-            continue
+    positions = spread_positions(len(recording), _PERSON_FRAMES)
+    frames = [frame.depth for frame in readable_frames(recording, positions) if frame.depth is not None]
     empty, camera = recording.background().depth, recording.camera
     try:
         if not frames:
             raise ValueError("there must be a frame that can be read, got none; check the recording")
-        depth = torch.stack([frame for frame in frames if frame is not None])
+        depth = torch.stack(frames)
         focal_length = focal_length_of_person(
             depth, far_readings(depth) if empty is None else empty, height, camera.cy
         )
@@ -349,8 +343,9 @@ def _video_in(folder: Path, side: str) -> list[Path]:
 
 
 def spread_positions(length: int, count: int) -> list[int]:
-    """At most `count` positions from 0 to length - 1, evenly apart."""
-    return sorted({round(i * (length - 1) / max(count - 1, 1)) for i in range(min(count, length))})
+    """At most `count` positions from 0 to length - 1, evenly apart, ends included; 0 alone where one is wanted."""
+    count = min(count, length)
+    return [round(i * (length - 1) / max(count - 1, 1)) for i in range(count)]
 
 
 def readable_frames(recording: Recording, positions: list[int]) -> Iterator[Frame]:
