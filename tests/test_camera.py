@@ -114,6 +114,7 @@ def test_rectified_points_share_their_row_and_give_their_depth(coefficients: int
     in_left = cv2.projectPoints(points, origin, origin, raw.K1, raw.D1)[0][:, 0]
     in_right = cv2.projectPoints(points, cv2.Rodrigues(raw.R)[0], raw.T, raw.K2, raw.D2)[0][:, 0]
     rectified = []
+    directly = raw.rectify_pixels(in_left, in_right)
     for pixels, lookup in zip((in_left, in_right), raw.rectify_maps(), strict=True):
         # The nearest entry of the map, refined by its two neighbours: the inverse of the map, by search.
         found = np.abs(lookup[None] - pixels[:, None, None]).sum(-1).reshape(len(pixels), -1).argmin(1)
@@ -127,6 +128,8 @@ def test_rectified_points_share_their_row_and_give_their_depth(coefficients: int
         rectified.append(np.stack([columns, rows], -1) + step[..., 0])
     inside = np.all([((p > 2) & (p < (317, 237))).all(1) for p in rectified], axis=0)
     assert inside.sum() > 100
+    for found, searched in zip(directly, rectified, strict=True):
+        assert np.abs(found - searched)[inside].max() < 0.02  # px
     left, right = rectified[0][inside], rectified[1][inside]
     assert np.abs(left[:, 1] - right[:, 1]).max() < 0.1  # px
     # The rectified left camera is turned, so compare distances from its centre, not depths.

@@ -15,9 +15,8 @@ import yaml
 
 from torchpose.atomic import replacing
 from torchpose.depthai import depthai_stereo
-from torchpose.vision.camera import RawStereo, StereoCamera
+from torchpose.vision.camera import RAW_KEYS, RawStereo, StereoCamera
 
-RAW_KEYS = ("K1", "D1", "K2", "D2", "R", "T")
 _KEYS = (
     "image_size",
     "focal_length",
@@ -79,7 +78,7 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
     camera, raw = calibration.camera, calibration.raw
     values: dict[str, Any] = {"image_size": [camera.width, camera.height], "frame_rate": camera.frame_rate}
     if raw is not None:
-        values |= {key: getattr(raw, key).tolist() for key in RAW_KEYS}
+        values = raw.values()
     elif calibration.person_height is not None:
         values |= {"depth_unit": calibration.depth_unit, "person_height": calibration.person_height}
         values |= {"principal_point": [camera.cx, camera.cy]}

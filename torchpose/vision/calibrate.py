@@ -270,17 +270,8 @@ def row_distance(
     raw: RawStereo, left: Float[np.ndarray, "*batch 2"], right: Float[np.ndarray, "*batch 2"]
 ) -> Float[np.ndarray, "*batch"]:
     """Row in the right image less row in the left, px, after rectification, of points at raw pixels of both."""
-    rotations = cv2.stereoRectify(
-        raw.K1, raw.D1, raw.K2, raw.D2, raw.image_size, raw.R, raw.T, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
-    )
-    rows = [
-        cv2.undistortPoints(pixels.reshape(-1, 1, 2).astype(np.float64), K, D, R=turn, P=projection)[:, 0, 1]
-        for pixels, K, D, turn, projection in (
-            (left, raw.K1, raw.D1, rotations[0], rotations[2]),
-            (right, raw.K2, raw.D2, rotations[1], rotations[3]),
-        )
-    ]
-    return (rows[1] - rows[0]).reshape(left.shape[:-1])
+    rectified_left, rectified_right = raw.rectify_pixels(left, right)
+    return rectified_right[..., 1] - rectified_left[..., 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,16 +360,11 @@ def _listed(left_out: dict[int, float]) -> str:
 
 def write_calibration(path: Path, rig: RigCalibration) -> None:
     """Write OpenCV's K1, D1, K2, D2, R, T (m) with the image size and the frame rate; the file appears whole."""
-    raw = rig.raw
-    values = {
-        "image_size": list(raw.image_size),
-        "frame_rate": raw.frame_rate,
-        **{name: getattr(raw, name).tolist() for name in ("K1", "D1", "K2", "D2", "R", "T")},
-    }
     comment = "".join(f"# {line}\n" for line in report(rig).splitlines())
     with replacing(path) as partial:
         partial.write_text(
-            comment + yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding="utf-8"
+            comment + yaml.safe_dump(rig.raw.values(), sort_keys=False, default_flow_style=None),
+            encoding="utf-8",
         )
 
 

@@ -7,6 +7,7 @@ pixel's centre.
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from torch.nn import functional as F
 
 # k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]: the lengths that OpenCV knows.
 DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
+RAW_KEYS = ("K1", "D1", "K2", "D2", "R", "T")  # OpenCV's names of what is known of a raw pair
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ class RawStereo:
     frame_rate: float = 20.0  # Hz
 
     def __post_init__(self) -> None:
-        for name in ("K1", "D1", "K2", "D2", "R", "T"):
+        for name in RAW_KEYS:
             value = getattr(self, name).astype(np.float64)
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} must be finite, got {value.tolist()}; check the calibration")
@@ -176,6 +178,29 @@ class RawStereo:
             cy=float(projection[1, 2]),
             baseline=float(-projection[0, 3] / projection[0, 0]),
             frame_rate=self.frame_rate,
+        )
+
+    def values(self) -> dict[str, Any]:
+        """The calibration as plain numbers and lists, as a file holds it."""
+        keys = {key: getattr(self, key).tolist() for key in RAW_KEYS}
+        return {"image_size": list(self.image_size), "frame_rate": self.frame_rate, **keys}
+
+    def rectify_pixels(
+        self, left: Float[np.ndarray, "*batch 2"], right: Float[np.ndarray, "*batch 2"]
+    ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
+        """Raw pixels (u, v) of both images as the rectified images show them, px: what `rectify_maps` undoes."""
+        left_rotation, right_rotation, projection = self._rectification
+
+        def rectified(
+            pixels: np.ndarray, matrix: np.ndarray, distortion: np.ndarray, rotation: np.ndarray
+        ) -> np.ndarray:
+            points = pixels.reshape(-1, 1, 2).astype(np.float64)
+            found = cv2.undistortPoints(points, matrix, distortion, R=rotation, P=projection[:, :3])
+            return found.reshape(pixels.shape)
+
+        return (
+            rectified(left, self.K1, self.D1, left_rotation),
+            rectified(right, self.K2, self.D2, right_rotation),
         )
 
     def rectify_maps(self) -> tuple[Float[np.ndarray, "height width 2"], Float[np.ndarray, "height width 2"]]:
