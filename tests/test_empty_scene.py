@@ -107,7 +107,7 @@ class TrueDisparity(StereoMatcher):
         super().__init__()
         self.answers = list(answers)
 
-    def match(self, left, right, mask, seeds, least, greatest):
+    def match(self, task):
         values = self.answers.pop(0)[None]
         return Disparity(values, torch.ones_like(values))
 
