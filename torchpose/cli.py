@@ -56,9 +56,7 @@ class InferConfig:
     background: str | None = None  # folder with images of the empty scene, instead of the folder's own
     output: str = "runs/infer"  # folder for the results
     max_frames: int | None = None  # take only the first so many frames; a camera needs it
-    max_width: int = (
-        800  # px; larger images are shrunk as they are read: twice the width costs eight times the matching
-    )
+    max_width: int = 800  # px; wider images are shrunk as they are read, and are matched much faster
     align: bool = True  # move the right images' rows onto the left's where they are more than 0.25 px apart
     fresh: bool = False  # start over instead of continuing an interrupted run
     seed: int = 0  # the same seed gives the same results

@@ -266,6 +266,7 @@ class Eyes(nn.Module):
         if frame.depth is not None:
             depth = frame.depth[None].to(device)
             images = frame.left[None].to(device) if frame.left is not None else depth_picture(depth)
+            grey = rgb_to_grayscale(images)[:, 0]
             with self.stopwatch.measure("background"):
                 log_odds = self.background(depth)
         else:
@@ -276,8 +277,8 @@ class Eyes(nn.Module):
                 assert self.scene_match is not None
                 log_odds = self.background(images)
                 region = search_region(log_odds, self.config.silhouette)
-                grey = rgb_to_grayscale(torch.cat([images, right]))[:, 0]
-                log_odds = log_odds + self.scene_match(grey[:1], grey[1:], region)
+                grey, grey_right = (rgb_to_grayscale(image)[:, 0] for image in (images, right))
+                log_odds = log_odds + self.scene_match(grey, grey_right, region)
                 region = search_region(log_odds, self.config.silhouette)
             with self.stopwatch.measure("stereo"):
                 seeds = last.disparity if last else None
@@ -295,7 +296,7 @@ class Eyes(nn.Module):
                 self.config.silhouette,
                 self.background_depth,
                 self.camera,
-                guide=rgb_to_grayscale(images)[:, 0],
+                guide=grey,
                 previous=last.silhouette if last else None,
             ).mask
             seen = depth.where(silhouette, torch.nan)
