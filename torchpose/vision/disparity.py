@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
@@ -126,14 +126,25 @@ def bridge_gaps(disparity: Float[Tensor, "height width"], step: float = 1.0) -> 
     return disparity.where(~disparity.isnan(), lines.nanmean(0))
 
 
+def nearest_known(
+    known: Bool[Tensor, "lines size"],
+) -> tuple[Int[Tensor, "lines size"], Int[Tensor, "lines size"]]:
+    """Columns of the known pixels next to each on the left and on the right, its own where it is known.
+
+    -1 and `size` where there is none.
+    """
+    size = known.shape[1]
+    place = torch.arange(size, device=known.device).expand_as(known)
+    before = place.where(known, -1).cummax(1).values
+    return before, place.where(known, size).flip(1).cummin(1).values.flip(1)
+
+
 def _bridged(disparity: Float[Tensor, "lines size"], step: float) -> Float[Tensor, "lines size"]:
     """The lines between the known pixels of each row; NaN where none spans the pixel."""
     size = disparity.shape[1]
-    place = torch.arange(size, device=disparity.device).expand_as(disparity)
-    known = ~disparity.isnan()
-    before = place.where(known, -1).cummax(1).values
-    after = place.where(known, size).flip(1).cummin(1).values.flip(1)
+    before, after = nearest_known(~disparity.isnan())
     first, last = disparity.gather(1, before.clamp_min(0)), disparity.gather(1, after.clamp_max(size - 1))
+    place = torch.arange(size, device=disparity.device)
     share = (place - before) / (after - before).clamp_min(1)
     joined = (before >= 0) & (after < size) & ((first - last).abs() <= step)
     return torch.lerp(first, last, share.to(disparity)).where(joined, torch.nan)

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchpose.vision.camera import StereoCamera
-from torchpose.vision.disparity import StereoMatcher
+from torchpose.vision.disparity import StereoMatcher, nearest_known
 from torchpose.vision.photometry import temporal_median
 from torchpose.vision.windows import window_max, window_min
 
@@ -191,16 +191,12 @@ def room_planes(disparity: Plane, config: EmptySceneConfig = EmptySceneConfig())
 
 def continue_rows(disparity: Plane, seen: Bool[Tensor, "height width"]) -> Plane:
     """The disparity, where not `seen` that of the nearest seen pixel of the row, of two the farther; else NaN."""
-    columns = torch.arange(disparity.shape[1], device=disparity.device).expand_as(disparity)
-    known = seen & disparity.isfinite()
-    before = torch.where(known, columns, -1).cummax(1).values
-    after = torch.where(known, columns, disparity.shape[1]).flip(1).cummin(1).values.flip(1)
-    sides = []
-    for index, there in ((before, before >= 0), (after, after < disparity.shape[1])):
-        side = disparity.gather(1, index.clamp(0, disparity.shape[1] - 1))
-        sides.append(torch.where(there, side, torch.inf))
-    farther = torch.minimum(sides[0], sides[1])
-    return torch.where(seen, disparity, torch.where(farther.isfinite(), farther, torch.nan))
+    width = disparity.shape[1]
+    before, after = nearest_known(seen & disparity.isfinite())
+    left = disparity.gather(1, before.clamp_min(0)).where(before >= 0, torch.inf)
+    right = disparity.gather(1, after.clamp_max(width - 1)).where(after < width, torch.inf)
+    farther = torch.minimum(left, right)
+    return disparity.where(seen, farther.where(farther.isfinite(), torch.nan))
 
 
 def _pieces_with(
