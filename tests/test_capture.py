@@ -6,31 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
+from calibration_file import calibrate, raw_values, stereo_values, without
 
-from torchpose.calibration import read_calibration, write_calibration
+from torchpose.calibration import read_calibration
 from torchpose.capture import camera_numbers, capture_recording
 from torchpose.recording import open_recording
 
 WIDTH, HEIGHT, RATE = 40, 24, 10.0
-STEREO = {
-    "image_size": [WIDTH, HEIGHT],
-    "focal_length": 40.0,
-    "principal_point": [19.5, 11.25],
-    "baseline": 0.12,
-    "frame_rate": RATE,
-    "rectified": True,
-}
-RAW = {
-    "image_size": [WIDTH, HEIGHT],
-    "frame_rate": RATE,
-    "K1": [[40.0, 0.0, 19.0], [0.0, 41.0, 12.0], [0.0, 0.0, 1.0]],
-    "D1": [0.05, -0.01, 0.001, -0.001, 0.0],
-    "K2": [[40.5, 0.0, 20.0], [0.0, 40.5, 11.0], [0.0, 0.0, 1.0]],
-    "D2": [0.04, -0.02, 0.0, 0.001],
-    "R": np.eye(3).tolist(),
-    "T": [-0.12, 0.001, 0.002],
-}
+STEREO = stereo_values(WIDTH, HEIGHT, RATE)
 
 
 class FakeDevice:
@@ -93,9 +76,7 @@ class FakeDevice:
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
-    path = tmp_path / "rig.yaml"
-    path.write_text(yaml.safe_dump(STEREO))
-    return path
+    return calibrate(tmp_path / "rig.yaml", STEREO)
 
 
 def levels(folder: Path) -> dict[int, tuple[int, int]]:
@@ -185,8 +166,7 @@ def test_ctrl_c_ends_the_capture_and_keeps_it(tmp_path: Path, rig: Path, monkeyp
 
 
 def test_raw_images_are_kept_raw_with_their_calibration_and_the_empty_scene_comes_along(tmp_path: Path):
-    rig = tmp_path / "raw.yaml"
-    rig.write_text(yaml.safe_dump(RAW))
+    rig = calibrate(tmp_path / "raw.yaml", raw_values(WIDTH, HEIGHT, RATE))
     scene = tmp_path / "empty"
     scene.mkdir()
     for side in ("left", "right"):
@@ -214,11 +194,6 @@ def test_a_video_file_may_stand_in_for_a_device(tmp_path: Path, rig: Path):
     assert levels(tmp_path / "new") == {2 * k: (20 * k, 20 * k) for k in range(6)}
 
 
-def spoilt(**changes: object) -> dict[str, object]:
-    values = STEREO | changes
-    return {key: value for key, value in values.items() if value is not None}
-
-
 @pytest.mark.parametrize(
     ("calibration", "devices", "message"),
     [
@@ -235,7 +210,7 @@ def spoilt(**changes: object) -> dict[str, object]:
             "must give the calibration's size, 40 x 24, got 40 x 24 and 40 x 30; calibrate it at a size",
         ),
         (
-            spoilt(baseline=None, depth_unit=0.001),
+            without(STEREO, "baseline") | {"depth_unit": 0.001},
             lambda: [FakeDevice([0])],
             "a live camera must be a stereo camera, got the calibration of a depth camera in .*rig.yaml; write",
         ),
@@ -244,7 +219,7 @@ def spoilt(**changes: object) -> dict[str, object]:
 def test_what_cannot_be_captured_leaves_nothing(
     tmp_path: Path, rig: Path, calibration: dict, devices: Callable[[], list[FakeDevice]], message: str
 ):
-    rig.write_text(yaml.safe_dump(calibration))
+    calibrate(rig, calibration)
     with pytest.raises(ValueError, match=message):
         capture_recording(devices(), tmp_path / "new", rig, 10)
     assert not (tmp_path / "new").exists()
@@ -272,25 +247,3 @@ def test_names_of_cameras(recording: str, numbers: tuple[int, ...] | None):
 def test_what_names_no_camera(recording: str):
     with pytest.raises(ValueError, match=r"must be camera:N, .* or camera:N\+M, two cameras, got camera:"):
         camera_numbers(recording)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        STEREO,
-        RAW,
-        spoilt(baseline=None, depth_unit=0.0005),
-        spoilt(baseline=None, depth_unit=0.0005, focal_length=None, person_height=1.7),
-    ],
-    ids=["stereo", "raw", "depth", "unknown intrinsics"],
-)
-def test_a_written_calibration_reads_back(tmp_path: Path, values: dict[str, object]):
-    path = tmp_path / "calibration.yaml"
-    path.write_text(yaml.safe_dump(values))
-    given = read_calibration(path)
-    write_calibration(tmp_path / "new" / "calibration.yaml", given)
-    written = read_calibration(tmp_path / "new" / "calibration.yaml")
-    assert (written.camera, written.depth_unit, written.person_height) == (
-        *(given.camera, given.depth_unit, given.person_height),
-    )
-    assert (written.raw is None) == (given.raw is None)

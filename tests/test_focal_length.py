@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
+from calibration_file import calibrate
 
-from torchpose.calibration import read_calibration
 from torchpose.recording import Backgrounds, Frame, open_recording, write_recording
 from torchpose.vision.background import far_readings
 from torchpose.vision.camera import StereoCamera
@@ -109,14 +108,7 @@ def test_nobody_and_nobody_whole_and_nobody_upright():
         focal_length_of_person(lying, empty, 1.75, cy)
 
 
-def person_calibration(**changes: object) -> dict[str, object]:
-    values = {"image_size": [WIDTH, HEIGHT], "frame_rate": 10, "depth_unit": 0.001, "person_height": 1.75}
-    return {key: value for key, value in (values | changes).items() if value is not None}
-
-
-def save(path: Path, values: dict[str, object]) -> Path:
-    path.write_text(yaml.safe_dump(values))
-    return path
+PERSON = {"image_size": [WIDTH, HEIGHT], "frame_rate": 10, "depth_unit": 0.001, "person_height": 1.75}
 
 
 @pytest.fixture
@@ -128,7 +120,7 @@ def walk(tmp_path: Path) -> Path:
         for i, x in enumerate(np.linspace(-1.2, 1.2, 9))
     ]
     write_recording(tmp_path, camera, frames, Backgrounds(depth=scene(180, None)[None]))
-    save(tmp_path / "calibration.yaml", person_calibration())
+    calibrate(tmp_path / "calibration.yaml", PERSON)
     return tmp_path
 
 
@@ -164,29 +156,13 @@ def test_a_recording_without_a_person_says_which_one(walk: Path):
         open_recording(walk)
 
 
-def test_the_calibration_of_such_a_camera(tmp_path: Path):
-    path = tmp_path / "calibration.yaml"
-    read = read_calibration(save(path, person_calibration(principal_point=[100, 70.5])))
-    assert (read.camera.cx, read.camera.cy, read.person_height) == (100, 70.5, 1.75)
-    for changes, message in (
-        ({"person_height": 175}, "person_height must be in m, 0.5 to 2.6, got 175; divide centimetres"),
-        ({"person_height": "tall"}, "person_height must be a positive number of m, got 'tall'"),
-        ({"focal_length": 200}, "a focal_length or a person_height to estimate it from, got both"),
-        ({"depth_unit": None, "baseline": 0.1}, "person_height must come with a depth_unit .* got none"),
-        ({"rectified": False}, "rectified must be true, got False"),
-        ({"person_height": None, "rectified": True}, "focal_length is missing"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            read_calibration(save(path, person_calibration(**changes)))
-
-
 def test_the_shared_depth_recording(shared_data: Path, tmp_path: Path):
     """Its calibration was made from the same person: 300 px, of which 290 to 310 are said to fit."""
     source = shared_data / "realsense_rehab"
     for path in source.iterdir():
         (tmp_path / path.name).symlink_to(path)
     (tmp_path / "calibration.yaml").unlink()
-    save(tmp_path / "calibration.yaml", person_calibration(image_size=[424, 240]))
+    calibrate(tmp_path / "calibration.yaml", PERSON | {"image_size": [424, 240]})
     with pytest.warns(UserWarning, match="focal length was estimated"):
         recording = open_recording(tmp_path)
     assert recording.camera.focal_length == pytest.approx(300, rel=0.06)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
+from calibration_file import calibrate, raw_stereo, raw_values, stereo_values, without
 from torch.testing import assert_close
 
 from torchpose.recording import Backgrounds, Recording, UnreadableFrame, VideoRecording, open_recording
@@ -17,24 +17,7 @@ from torchpose.video import VideoFile
 from torchpose.vision.camera import RawStereo, StereoCamera
 
 WIDTH, HEIGHT, RATE, LENGTH = 48, 32, 12.5, 60
-STEREO = {
-    "image_size": [WIDTH, HEIGHT],
-    "focal_length": 40.0,
-    "principal_point": [23.5, 15.25],
-    "baseline": 0.12,
-    "frame_rate": RATE,
-    "rectified": True,
-}
-RAW = {
-    "image_size": [WIDTH, HEIGHT],
-    "frame_rate": RATE,
-    "K1": [[40.0, 0.0, 23.0], [0.0, 41.0, 16.0], [0.0, 0.0, 1.0]],
-    "D1": [0.05, -0.01, 0.001, -0.001, 0.0],
-    "K2": [[40.5, 0.0, 24.0], [0.0, 40.5, 15.0], [0.0, 0.0, 1.0]],
-    "D2": [0.04, -0.02, 0.0, 0.001],
-    "R": cv2.Rodrigues(np.array([0.01, -0.02, 0.015]))[0].tolist(),
-    "T": [-0.12, 0.001, 0.002],
-}
+STEREO = stereo_values(WIDTH, HEIGHT, RATE)
 
 
 def moving_images(count: int = LENGTH, width: int = WIDTH, height: int = HEIGHT, seed: int = 0) -> np.ndarray:
@@ -89,12 +72,6 @@ def wipe(path: Path, numbers: list[int]) -> None:
         offset, length = places[number]
         data[offset : offset + length] = bytes(length)
     path.write_bytes(data)
-
-
-def calibrate(path: Path, values: dict) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(yaml.safe_dump(values))
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -296,16 +273,12 @@ def test_raw_videos_are_rectified_frame_by_frame_when_they_are_read(
     path = write_video(tmp_path / "both.mkv", np.concatenate(pair, axis=2))
     count, rectify = [], RawStereo.rectify
     monkeypatch.setattr(RawStereo, "rectify", lambda *images: count.append(1) or rectify(*images))
-    recording = open_recording(path, calibration=calibrate(tmp_path / "raw.yaml", RAW))
+    values = raw_values(WIDTH, HEIGHT, RATE)
+    recording = open_recording(path, calibration=calibrate(tmp_path / "raw.yaml", values))
     assert not count
     frame = recording[7]
     assert len(count) == 1
-    raw = RawStereo(
-        **{key: np.array(RAW[key]) for key in ("K1", "D1", "K2", "D2", "R", "T")},
-        image_size=(WIDTH, HEIGHT),
-        frame_rate=RATE,
-    )
-    left, right, camera = rectify(raw, *(to_tensor(images[7])[None] for images in pair))
+    left, right, camera = rectify(raw_stereo(values), *(to_tensor(images[7])[None] for images in pair))
     assert recording.camera == camera
     assert_close(frame.left, left[0])
     assert_close(frame.right, right[0])
@@ -403,7 +376,7 @@ def test_videos_that_do_not_fit(tmp_path: Path):
         match=r"both.mkv must have twice the calibration's width, 80 x 32, got 96 x 32; .*right=FILE",
     ):
         side_by_side(tmp_path, image_size=[40, HEIGHT])()
-    depth = {key: value for key, value in STEREO.items() if key != "baseline"} | {"depth_unit": 0.001}
+    depth = without(STEREO, "baseline") | {"depth_unit": 0.001}
     with pytest.raises(ValueError, match="must be of a stereo pair, got the calibration of a depth camera"):
         open_recording(tmp_path / "both.mkv", calibration=calibrate(tmp_path / "calibration.yaml", depth))
     calibrate(tmp_path / "calibration.yaml", STEREO)
