@@ -16,6 +16,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "vision": (
         "camera",
         "windows",
+        "density",
         "photometry",
         "disparity",
         "disparity_space",

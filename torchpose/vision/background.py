@@ -4,13 +4,13 @@ Images are RGB in [0, 1], depth is metres along the left camera's z axis, NaN wh
 Log-odds are log P(foreground) / P(background) per pixel, saturated so that no one cue settles a pixel.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose.vision.density import reading_density
 from torchpose.vision.photometry import gradient_squared, noise_line, relative_gain, temporal_median
 from torchpose.vision.windows import window_max, window_mean, window_min
 
@@ -204,9 +204,9 @@ class DepthBackground(nn.Module):
                 f"got {tuple(depth.shape[-2:])}; record the background with the same camera"
             )
         depth, config = _clean_depth(depth, self.config.max_depth), self.config
-        outlier = config.outliers / config.max_depth
-        foreground = torch.where(depth < self.depth, (1 - config.outliers) / self.depth, 0) + outlier
-        background = (1 - config.outliers) * _normal(depth - self.depth, self.sigma) + outlier
+        foreground = torch.where(depth < self.depth, (1 - config.outliers) / self.depth, 0)
+        foreground = foreground + config.outliers / config.max_depth
+        background = reading_density(depth - self.depth, self.sigma, config.outliers, config.max_depth)
         log_odds = torch.where(self.depth.isnan(), 1, torch.log(foreground / background).clamp(-4, 4))
         return torch.where(depth.isnan(), 0, log_odds)
 
@@ -225,7 +225,3 @@ def _clean_depth(
     depth: Float[Tensor, "*batch height width"], greatest: float
 ) -> Float[Tensor, "*batch height width"]:
     return torch.where((depth > 0) & (depth <= greatest), depth, torch.nan)
-
-
-def _normal(deviation: Tensor, sigma: Tensor) -> Tensor:
-    return torch.exp(-0.5 * (deviation / sigma).square()) / (sigma * math.sqrt(2 * math.pi))

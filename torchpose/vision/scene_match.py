@@ -4,13 +4,14 @@ A cast shadow changes the scene's colour, but the pair matches where it matched 
 in [0, 1]; disparity d = x_left - x_right in px, NaN where unknown.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose.vision.density import reading_density
+from torchpose.vision.disparity import bounding_box
 from torchpose.vision.windows import window_mean, window_min
 
 Grey = Float[Tensor, "batch height width"]
@@ -84,24 +85,19 @@ class SceneMatch(nn.Module):
         log_odds = torch.zeros_like(left)
         if mask is None:
             mask = torch.ones_like(left, dtype=torch.bool)
-        rows, columns = (mask.any(axis).any(0).nonzero()[:, 0].tolist() for axis in (2, 1))
-        if not rows:
+        if not mask.any():
             return log_odds
         config, margin = self.config, self.config.radius + 1
-        box = (
-            slice(max(0, rows[0] - margin), rows[-1] + margin + 1),
-            slice(max(0, columns[0] - margin), columns[-1] + margin + 1),
-        )
+        rows, columns = (slice(max(0, at.start - margin), at.stop + margin) for at in bounding_box(mask))
+        box = rows, columns
         similarity = _similarity(left, right, self.disparity, config.radius, config.noise, box)
         empty = self.similarity[box]
         spread = config.spread + config.spread_growth * (1 - empty)
-        any_value = config.outliers / 2  # a similarity lies in [-1, 1]
-        scene = (1 - config.outliers) * _normal((empty - similarity).clamp_min(0), spread) + any_value
-        other = (1 - config.outliers) * _normal(
-            similarity, empty.new_tensor(config.chance_spread)
-        ) + any_value
+        span = 2.0  # a similarity lies in [-1, 1]
+        scene = reading_density((empty - similarity).clamp_min(0), spread, config.outliers, span)
+        other = reading_density(similarity, config.chance_spread, config.outliers, span)
         found = config.weight * window_min((other / scene).log().nan_to_num(0), 1).clamp_max(0)
-        log_odds[:, box[0], box[1]] = found
+        log_odds[:, rows, columns] = found
         return torch.where(mask, log_odds, 0)
 
 
@@ -142,7 +138,3 @@ def _similarity(
     power = window_mean(left.square() + right.square(), radius) * inverse
     variances = (power - mean_left.square() - mean_right.square()).clamp_min(0) + 2 * noise**2
     return torch.where(known & (count >= 0.5), 2 * covariance / variances, torch.nan)
-
-
-def _normal(deviation: Tensor, sigma: Tensor) -> Tensor:
-    return torch.exp(-0.5 * (deviation / sigma).square()) / (sigma * math.sqrt(2 * math.pi))

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchpose.vision.camera import StereoCamera
+from torchpose.vision.density import reading_density
 from torchpose.vision.windows import window_max, window_min
 
 Plane = Float[Tensor, "height width"]
@@ -188,7 +189,7 @@ def _depth_evidence(
     near = ~((depth - middle[:, None, None]).abs() > config.depth_range)  # True where either is unknown
     usual = (1 - outliers) / (2 * config.depth_range) + outliers / span
     log_person = torch.where(in_front & near, math.log(usual), math.log(outliers / span))
-    at_background = (1 - outliers) * _normal(depth - background_depth, sigma) + outliers / span
+    at_background = reading_density(depth - background_depth, sigma, outliers, span)
     log_background = torch.where(background_depth.isnan(), math.log(1 / span), at_background.log())
     evidence = (log_person - log_background).clamp(-config.depth_weight, config.depth_weight)
     evidence = torch.where(near, evidence, -2 * config.depth_weight)  # out, whatever the colour
@@ -260,7 +261,3 @@ def _person_part(
     filled = inside & ((area <= config.max_hole * areas[chosen]) | (total > config.see_through * area))
     filled[0] = True  # label 0 of the holes is the person
     return torch.from_numpy(filled[holes]).to(mask.device)
-
-
-def _normal(deviation: Tensor, sigma: Tensor) -> Tensor:
-    return torch.exp(-0.5 * (deviation / sigma).square()) / (sigma * math.sqrt(2 * math.pi))
