@@ -27,6 +27,7 @@ from torchpose.export import (
     write_poses_npz,
     write_summary,
 )
+from torchpose.session import summary_table
 
 STATUS = ("absent", "entering", "tracked", "partial", "recovered", "lost")
 
@@ -277,3 +278,21 @@ def test_a_video_that_fails_leaves_nothing(tmp_path: Path):
     with pytest.raises(ValueError, match="images must have the video's size 64 x 48, got 32 x 48"):
         fail()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_whoever_enters_without_a_pose_is_not_answered(sequence: PoseSequence) -> None:
+    assert sequence.answered == (False, True, True, True, True, False)
+    joints = sequence.joints.clone()
+    joints[1], joints[3, 4, 0] = torch.nan, torch.nan
+    assert dataclasses.replace(sequence, joints=joints).answered == (False, False, True, True, True, False)
+
+
+def test_a_run_without_a_pose_has_no_misfit_to_tell() -> None:
+    summary = {
+        "frames": 2,
+        "status": {"entering": 2},
+        "answered": 0.0,
+        "point_to_model_m": {"mean": math.nan},
+    }
+    rest = {"seconds": 1.0, "seconds_per_frame": 0.5, "cpu_ms_per_frame": {}, "problems": []}
+    assert "point to model    -\n" in summary_table(summary | rest, Path("out"))

@@ -79,7 +79,8 @@ class PoseSequence:
     @property
     def answered(self) -> tuple[bool, ...]:
         """Whether each frame has a pose."""
-        return tuple(status not in EMPTY_STATUSES for status in self.status)
+        posed = self.joints.isfinite().flatten(1).any(1).tolist()  # whoever is entering may have none yet
+        return tuple(p and status not in EMPTY_STATUSES for p, status in zip(posed, self.status, strict=True))
 
     @classmethod
     def join(cls, parts: Sequence["PoseSequence"]) -> "PoseSequence":

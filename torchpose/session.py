@@ -256,10 +256,11 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
     """What a person wants to know at the end, in a few lines."""
     status = ", ".join(f"{count} {name}" for name, count in summary["status"].items())
     distance = summary["point_to_model_m"]["mean"]
+    fitted = "-" if math.isnan(distance) else f"{1000 * distance:.1f} mm"
     lines = [
         f"frames            {summary['frames']}: {status}",
         f"answered          {100 * summary['answered']:.1f} %",
-        f"point to model    {1000 * distance:.1f} mm",
+        f"point to model    {fitted}",
         f"time              {summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame",
         "CPU ms a frame    "
         + ", ".join(f"{name} {ms:.0f}" for name, ms in summary["cpu_ms_per_frame"].items()),
