@@ -17,6 +17,11 @@ from torchpose.vision.windows import window_max, window_mean, window_min
 Frames = Float[Tensor, "frames 3 height width"]
 Plane = Float[Tensor, "height width"]
 Planes = Float[Tensor, "batch height width"]
+# Bounds of the log-odds: of a pixel, of one that may be in a shadow, on a mixed edge, and where the scene glares.
+UNCHANGED, CHANGED = -6.0, 4.0
+SHADED, MIXED = -2.0, -4.0
+GLARING = (-1.0, 0.5)
+CHANGED_SLOPE, SHADED_SLOPE = 4.0, 3.0  # log-odds by which a misfit of 1 more than the threshold counts
 
 
 @dataclass(frozen=True)
@@ -31,9 +36,7 @@ class BackgroundConfig:
     shadow_tint: float = 0.03  # relative change of colour in a shadow, lit by another part of the room
     unchanged_threshold: float = 2.5  # mean squared change of a 3 x 3 window from which it has changed
     shadow_threshold: float = 1.2  # mean squared misfit of a 5 x 5 window from which it is no shadow
-    unknown: float = (
-        -1.0
-    )  # log-odds where the scene was never seen: also around whoever hides it all the time
+    unknown: float = -1.0  # log-odds where the scene was never seen: who hides it, and their rim
 
     def __post_init__(self) -> None:
         for name in ("noise_floor", "unchanged_threshold", "shadow_threshold"):
@@ -42,6 +45,8 @@ class BackgroundConfig:
         for name in ("gain_tolerance", "jitter", "shadow_tint"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
+        if not self.glare > 0:
+            raise ValueError(f"glare must be positive, got {self.glare}; above 1 switches it off")
         if not 0 < self.shadow_min <= 1:
             raise ValueError(f"shadow_min must be in (0, 1], got {self.shadow_min}; 1 means no shadows")
 
@@ -56,7 +61,6 @@ class BackgroundModel(nn.Module):
     """
 
     center: Float[Tensor, "3 height width"]  # the empty scene, 0 where unknown
-    variance: Float[Tensor, "3 height width"]  # of an unchanged pixel's difference from it
     known: Bool[Tensor, "height width"]  # the scene was seen there
     _weight: Tensor
     _shadow_weight: Tensor
@@ -98,20 +102,26 @@ class BackgroundModel(nn.Module):
         tinted = variance + (config.shadow_tint * center).square()
         center, variance = torch.where(known, center, 0), torch.where(known, variance, torch.inf)
         tinted = torch.where(known, tinted, torch.inf)  # so that unknown pixels weigh nothing
-        shares = [window_mean(known.to(center.dtype), radius).clamp_min(1e-6) for radius in (1, 2)]
-        self.register_buffer("center", center, persistent=False)
-        self.register_buffer("variance", variance, persistent=False)
-        self.register_buffer("known", known, persistent=False)
-        self.register_buffer("_weight", 1 / (3 * variance), persistent=False)
-        self.register_buffer("_shadow_weight", center / (3 * tinted), persistent=False)
-        self.register_buffer("_square_weight", 1 / (3 * tinted), persistent=False)
         power = window_mean((center.square() / (3 * tinted)).sum(0), 2).clamp_min(1e-12)
-        self.register_buffer("_power", power, persistent=False)
-        self.register_buffer("_share", shares[0], persistent=False)
-        self.register_buffer("_shadow_share", shares[1], persistent=False)
+        share, shadow_share = (
+            window_mean(known.to(center.dtype), radius).clamp_min(1e-6) for radius in (1, 2)
+        )
+        for name, value in (
+            ("center", center),
+            ("known", known),
+            ("_weight", 1 / (3 * variance)),
+            ("_shadow_weight", center / (3 * tinted)),
+            ("_square_weight", 1 / (3 * tinted)),
+            ("_power", power),
+            ("_share", share),
+            ("_shadow_share", shadow_share),
+        ):
+            self.register_buffer(name, value, persistent=False)
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:
         """Log-odds in [-6, 4]: about -6 unchanged, -2 darkened like a shadow, 4 something else.
+
+        Where the scene glares they are in [-1, 0.5], and where it was never seen they are `unknown`.
 
         What looks like a shadow may be a grey shirt: depth tells, in `person_silhouette`. So match the stereo
         pair in `search_region`, which keeps both, and not where the log-odds are positive.
@@ -124,17 +134,19 @@ class BackgroundModel(nn.Module):
         images = images / relative_gain(images, self.center)
         change = (self._weight * (images - self.center).square()).sum(1)  # 1 on average if unchanged
         unchanged = window_min(window_mean(change, 1) / self._share, 1)
-        log_unchanged = (4 * (unchanged - self.config.unchanged_threshold)).clamp(-6, 4)
+        log_unchanged = (CHANGED_SLOPE * (unchanged - self.config.unchanged_threshold)).clamp(
+            UNCHANGED, CHANGED
+        )
         shaded = window_min(self._shadow_misfit(images), 2)
-        log_shaded = (3 * (shaded - self.config.shadow_threshold)).clamp(-2, 4)
+        log_shaded = (SHADED_SLOPE * (shaded - self.config.shadow_threshold)).clamp(SHADED, CHANGED)
         log_odds = torch.minimum(log_unchanged, log_shaded)
         # A pixel on the person's edge mixes both and belongs to the side that gave it more than half: beside
         # unchanged pixels, its change must be half of the strongest near by (a quarter of the square).
         mixed = (change < 0.25 * window_max(change, 1)) & (window_min(log_unchanged, 1) < 0)
-        log_odds = torch.where(mixed & (log_unchanged > 0), log_odds.clamp_max(-4), log_odds)
+        log_odds = torch.where(mixed & (log_unchanged > 0), log_odds.clamp_max(MIXED), log_odds)
         # Of a pixel that glares, any shade may be a shadow, and anything bright may hide.
         glaring = (self.center >= self.config.glare).all(0)
-        log_odds = torch.where(glaring, log_odds.clamp(-1, 0.5), log_odds)
+        log_odds = torch.where(glaring, log_odds.clamp(*GLARING), log_odds)
         return torch.where(self.known, log_odds, self.config.unknown)
 
     def _shadow_misfit(self, images: Float[Tensor, "batch 3 height width"]) -> Planes:
