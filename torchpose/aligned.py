@@ -32,16 +32,16 @@ class AlignedRecording:
     def __getitem__(self, position: int, /) -> Frame:
         """The frame at `position`, 0 to len - 1. Raises UnreadableFrame as the recording does."""
         frame = self.recording[position]
-        return (
-            frame
-            if frame.right is None
-            else replace(frame, right=align_rows(frame.right[None], self.alignment)[0])
-        )
+        if frame.right is None:
+            return frame
+        return replace(frame, right=align_rows(frame.right[None], self.alignment)[0])
 
     def background(self) -> Backgrounds:
         """The frames of the empty scene, if there are any."""
         found = self.recording.background()
-        return found if found.right is None else replace(found, right=align_rows(found.right, self.alignment))
+        if found.right is None:
+            return found
+        return replace(found, right=align_rows(found.right, self.alignment))
 
 
 def align_recording(recording: Recording) -> Recording:
@@ -60,9 +60,8 @@ def align_recording(recording: Recording) -> Recording:
     if alignment.model is None:
         return recording
     corrected = measure_alignment(left, align_rows(right, alignment))
-    return (
-        AlignedRecording(recording, alignment) if corrected.typical < WORTH * alignment.typical else recording
-    )
+    worth = corrected.typical < WORTH * alignment.typical
+    return AlignedRecording(recording, alignment) if worth else recording
 
 
 def _pairs(recording: Recording) -> list[tuple[Image, Image]]:

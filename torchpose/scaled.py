@@ -56,8 +56,6 @@ class ScaledRecording:
 
 def at_most(recording: Recording, width: int) -> Recording:
     """The recording with images of at most `width` px, itself if they are."""
-    return (
-        ScaledRecording(recording, width / recording.camera.width)
-        if recording.camera.width > width
-        else recording
-    )
+    if recording.camera.width <= width:
+        return recording
+    return ScaledRecording(recording, width / recording.camera.width)

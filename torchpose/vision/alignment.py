@@ -79,9 +79,7 @@ class Alignment:
     """How far the right image of a point lies below its left image; all NaN where matches are too few."""
 
     dy: float  # px, median row in the right image less row in the left
-    typical: (
-        float  # px, median over the image of the rows' distance, whatever its sign: a roll has it, and no dy
-    )
+    typical: float  # px, median of the rows' distance over the image; a roll has one, and no dy
     spread: float  # px, robust standard deviation of one match about what a misaligned rig can do
     matches: int  # that are left to measure by
     roll: float  # rad, slope of the rows' difference along a row: the right image is turned clockwise
