@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -112,6 +113,18 @@ def test_full_precision_agrees_with_the_table(result: Path):
     assert ((sd > 0) & (sd <= torch.pi)).all()
 
 
+def interrupted_at(last: int) -> Callable[..., object]:
+    """A step of the pipeline that Ctrl-C ends at this position."""
+    step = tp.StereoToPose.step
+
+    def interrupted(self, recording, position):
+        if position == last:
+            raise KeyboardInterrupt
+        return step(self, recording, position)
+
+    return interrupted
+
+
 def test_an_interrupted_run_goes_on_and_ends_the_same(
     folder: Path,
     result: Path,
@@ -121,15 +134,9 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 ):
     monkeypatch.setattr(session, "PART", 2)
     step = tp.StereoToPose.step
-
-    def interrupted(self, recording, position):
-        if position == 3:
-            raise KeyboardInterrupt
-        return step(self, recording, position)
-
     command = [f"recording={folder}", f"output={tmp_path}", *QUICK]
     with monkeypatch.context() as patch:
-        patch.setattr(tp.StereoToPose, "step", interrupted)
+        patch.setattr(tp.StereoToPose, "step", interrupted_at(3))
         assert infer_main(command) == 130
     assert "goes on" in capsys.readouterr().err
     assert not (tmp_path / "poses.csv").exists()
@@ -251,10 +258,25 @@ def test_a_live_camera_is_recorded_and_then_run(
     assert recording.background().left.shape == (1, 3, 240, 320)
     assert infer_main(command) == 2
     assert "recording runs that, and fresh=true or another output records anew" in capsys.readouterr().err
-    monkeypatch.setattr(cli.Session, "run", lambda *_: None)
-    monkeypatch.setattr(cli, "summary_table", lambda *_: "")
-    assert infer_main([*command, "fresh=true", "max_frames=3"]) == 0
+    # An interrupted run goes on with what was recorded, and with nothing that another command recorded.
+    command, step = [*command[: -len(QUICK) - 1], "max_frames=3", *QUICK], tp.StereoToPose.step
+    with monkeypatch.context() as patch:
+        patch.setattr(session, "PART", 2)
+        patch.setattr(tp.StereoToPose, "step", interrupted_at(2))
+        assert infer_main([*command, "fresh=true"]) == 130
+    assert "the same command again goes on" in capsys.readouterr().err
     assert len(tp.open_recording(tmp_path / "out" / "recording")) == 3
+    for change in ("recording=camera:1", "max_frames=4"):
+        assert infer_main([*command, change]) == 2
+        assert f"got {tmp_path / 'out' / 'recording'} with an earlier one" in capsys.readouterr().err
+    opened.clear()
+    seen = []
+    monkeypatch.setattr(tp.StereoToPose, "step", lambda s, r, p: seen.append(p) or step(s, r, p))
+    assert infer_main(command) == 0
+    assert (seen, opened) == ([2], [])
+    assert f"going on with {tmp_path / 'out' / 'recording'}; fresh=true records" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["frames"], summary["settings"]["recording"]) == (3, "camera:0")
 
 
 def test_a_live_camera_needs_its_settings_and_a_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -23,7 +23,7 @@ from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
 from torchpose.scaled import at_most
-from torchpose.session import Session, settings_of, summary_table
+from torchpose.session import Session, is_interrupted, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups, describe
 from torchpose.study import (
     THESIS_ACCURACY,
@@ -164,12 +164,12 @@ def train_main(argv: Sequence[str]) -> int:
 
 def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
-    output = Path(config.output)
+    output, settings = Path(config.output), settings_of(config)
     if config.recording is None:
         print("no recording given: making one (recording=DIR runs yours)")
         recording: Recording = demo_recording(config.seed)
     else:
-        config = _captured(config, output / "recording")
+        config = _captured(config, output)
         assert config.recording is not None
         recording = open_recording(config.recording, config.right, config.calibration, config.background)
     rows_before = None
@@ -180,18 +180,27 @@ def infer(config: InferConfig, device: torch.device) -> None:
             rows_before = recording.alignment.typical * shrunk
     recording = at_most(recording, config.max_width)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    session = Session(model, recording, output, settings_of(config), __version__, rows_before)
+    session = Session(model, recording, output, settings, __version__, rows_before)
     print(summary_table(session.run(config.fresh, config.max_frames), output))
 
 
-def _captured(config: InferConfig, folder: Path) -> InferConfig:
-    """The configuration that runs what was recorded into `folder`, where the recording is a live camera."""
+def _captured(config: InferConfig, output: Path) -> InferConfig:
+    """The configuration that runs what was recorded into `output`, where the recording is a live camera.
+
+    What an interrupted run of the same command has recorded is not recorded again.
+    """
     assert config.recording is not None
     numbers = camera_numbers(config.recording)
     if numbers is None:
         return config
     assert config.calibration is not None
     assert config.max_frames is not None
+    folder = output / "recording"
+    recorded = replace(config, recording=str(folder), calibration=None, background=None)
+    interrupted = folder.is_dir() and is_interrupted(output, settings_of(config), __version__)
+    if interrupted and not config.fresh:
+        print(f"going on with {folder}; fresh=true records anew")
+        return recorded
     devices = open_cameras(numbers)
     if config.fresh:
         shutil.rmtree(folder, ignore_errors=True)
@@ -202,7 +211,7 @@ def _captured(config: InferConfig, folder: Path) -> InferConfig:
         for device in devices:
             device.release()
     print(f"recorded {capture.frames} frames in {capture.seconds:.1f} s, {capture.dropped} dropped")
-    return replace(config, recording=str(folder), calibration=None, background=None)
+    return recorded
 
 
 def train(config: TrainConfig, device: torch.device) -> None:

@@ -40,6 +40,7 @@ from torchpose.vision.alignment import alignment_warning, correction_warning, me
 
 CHECKED = 3  # frames whose rows are compared
 PART = 50  # frames between two savings: what an interruption costs at the most
+_PARTS, _STAMP = "parts", "settings.txt"  # of a run that is not finished: their folder, and whose they are
 _EYES = "eyes_"  # before the names of the eyes' state, beside the tracker's
 _SHOWN = ("elbow_flexion_left", "elbow_flexion_right", "knee_flexion_left", "knee_flexion_right")
 
@@ -70,7 +71,7 @@ class Session:
     ):
         self.model, self.recording, self.output = model, recording, output
         self.settings, self.version, self.rows_before = settings, version, rows_before
-        self.parts = output / "parts"
+        self.parts = output / _PARTS
         self.problems: list[str] = []
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
@@ -118,14 +119,10 @@ class Session:
 
     def _resume(self, fresh: bool) -> int:
         """How many frames the parts of an interrupted run hold; they are removed if they are not ours."""
-        key = hashlib.sha256(
-            json.dumps([self.settings, self.version], sort_keys=True, default=str).encode()
-        ).hexdigest()
-        stamp = self.parts / "settings.txt"
-        if fresh or not stamp.is_file() or stamp.read_text() != key:
+        if fresh or not is_interrupted(self.output, self.settings, self.version):
             shutil.rmtree(self.parts, ignore_errors=True)
-            with replacing(stamp) as partial:
-                partial.write_text(key)
+            with replacing(self.parts / _STAMP) as partial:
+                partial.write_text(_key(self.settings, self.version))
             return 0
         files = self._files()
         if not files:
@@ -250,6 +247,18 @@ class Session:
             "cpu_ms_per_frame": {name: 1000 * value / max(frames, 1) for name, value in stages.items()},
             "problems": self.problems,
         }
+
+
+def is_interrupted(output: Path, settings: Mapping[str, Any], version: str) -> bool:
+    """Whether a folder holds an interrupted run with these settings, which `Session.run` goes on with."""
+    stamp = output / _PARTS / _STAMP
+    return stamp.is_file() and stamp.read_text() == _key(settings, version)
+
+
+def _key(settings: Mapping[str, Any], version: str) -> str:
+    """What tells one run from another; `fresh` says how it begins, not what it is."""
+    settings = {name: value for name, value in settings.items() if name != "fresh"}
+    return hashlib.sha256(json.dumps([settings, version], sort_keys=True, default=str).encode()).hexdigest()
 
 
 def summary_table(summary: Mapping[str, Any], output: Path) -> str:
