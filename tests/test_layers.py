@@ -17,6 +17,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "camera",
         "windows",
         "density",
+        "pieces",
         "photometry",
         "disparity",
         "disparity_space",

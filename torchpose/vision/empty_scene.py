@@ -8,8 +8,6 @@ frame does, it stays unknown. Left-camera frame, metres; disparity in px, NaN wh
 import warnings
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -18,6 +16,7 @@ from torch.nn import functional as F
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.disparity import StereoMatcher, nearest_known
 from torchpose.vision.photometry import temporal_median
+from torchpose.vision.pieces import connected_pieces
 from torchpose.vision.windows import window_max, window_min
 
 Frames = Float[Tensor, "frames 3 height width"]
@@ -124,11 +123,7 @@ def find_people(
             "record a frame or two of the empty scene into its folder background/",
             stacklevel=2,
         )
-        return _rim(
-            torch.stack([_tallest(p, d, camera, config) for p, d in zip(pieces, disparity, strict=True)]),
-            standing,
-            config,
-        )
+        return _rim(_tallest(pieces, disparity, camera, config), standing, config)
     depth = camera.depth(disparity)
     people = torch.zeros_like(moved)
     # Whoever rests in one frame moves in another: in the second round, whatever stands where a person was
@@ -136,13 +131,10 @@ def find_people(
     for _ in range(2):
         found = torch.where(people, disparity, torch.nan).nanmedian(0).values
         resting = (disparity - found).abs() < config.plane_noise
-        rows = []
-        for index in range(len(disparity)):
-            seeds = (moved[index] | resting[index]) & standing[index]
-            measured = depth[index][moved[index] if moving[index] else seeds]
-            near = (depth[index] - measured.nanmedian()).abs() < config.reach
-            rows.append(_pieces_with(pieces[index] & near, seeds, config.least_moved // 2))
-        people = torch.stack(rows)
+        seeds = (moved | resting) & standing
+        measured = depth.where(moved.where(moving[:, None, None], seeds), torch.nan)
+        near = (depth - _middle(measured)).abs() < config.reach
+        people = _pieces_with(pieces & near, seeds, config.least_moved // 2)
     return _rim(people, standing, config)
 
 
@@ -199,32 +191,32 @@ def continue_rows(disparity: Plane, seen: Bool[Tensor, "height width"]) -> Plane
     return disparity.where(seen, farther.where(farther.isfinite(), torch.nan))
 
 
-def _pieces_with(
-    pieces: Bool[Tensor, "height width"], seeds: Bool[Tensor, "height width"], least: int
-) -> Bool[Tensor, "height width"]:
+def _middle(values: Planes) -> Float[Tensor, "frames 1 1"]:
+    """Median of each frame, without NaN."""
+    return values.flatten(1).nanmedian(1).values[:, None, None]
+
+
+def _pieces_with(pieces: Masks, seeds: Masks, least: int) -> Masks:
     """The connected pieces that hold `least` seeds."""
-    count, labels = cv2.connectedComponents(pieces.cpu().numpy().astype(np.uint8), connectivity=8)
-    held = np.bincount(labels[seeds.cpu().numpy()], minlength=count) >= least
+    found = connected_pieces(pieces)
+    held = torch.bincount(found.labels[seeds], minlength=len(found.area)) >= least
     held[0] = False
-    return torch.from_numpy(held[labels]).to(pieces.device)
+    return held[found.labels]
 
 
-def _tallest(
-    pieces: Bool[Tensor, "height width"], disparity: Plane, camera: StereoCamera, config: EmptySceneConfig
-) -> Bool[Tensor, "height width"]:
-    """The connected piece that is the tallest within a person's height, if there is any."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(
-        pieces.cpu().numpy().astype(np.uint8), connectivity=8
-    )
-    depth, best, person = camera.depth(disparity).cpu().numpy(), config.smallest, 0
-    for index in range(1, count):
-        if stats[index, cv2.CC_STAT_AREA] < config.least_moved:
-            continue
-        rows = stats[index, cv2.CC_STAT_HEIGHT]
-        height = float(rows * np.median(depth[labels == index]) / camera.focal_length)
-        if best < height < config.tallest:
-            best, person = height, index
-    return torch.from_numpy((labels == person) & (person > 0)).to(pieces.device)
+def _tallest(pieces: Masks, disparity: Planes, camera: StereoCamera, config: EmptySceneConfig) -> Masks:
+    """The connected piece of each frame that is the tallest within a person's height, if there is any."""
+    found = connected_pieces(pieces)
+    label, depth = found.labels.flatten(), camera.depth(disparity).flatten()
+    by_depth = depth.argsort()
+    # Piece after piece, the nearest pixel first.
+    ordered = depth[by_depth[label[by_depth].argsort(stable=True)]]
+    first = found.area.cumsum(0) - found.area
+    middle = 0.5 * (ordered[first + (found.area - 1) // 2] + ordered[first + found.area // 2])
+    height = found.box[:, 3] * middle / camera.focal_length
+    fits = (found.area >= config.least_moved) & (config.smallest < height) & (height < config.tallest)
+    person = found.best(height.where(fits, 0))
+    return (found.labels == person[:, None, None]) & (person > 0)[:, None, None]
 
 
 def _rim(people: Masks, standing: Masks, config: EmptySceneConfig) -> Masks:
@@ -236,8 +228,7 @@ def _rim(people: Masks, standing: Masks, config: EmptySceneConfig) -> Masks:
 def _in_right_image(people: Masks, disparity: Planes) -> Masks:
     """The same people in the right images: each pixel moved by its disparity, or the middle one of the person."""
     inside = torch.where(people, disparity, torch.nan)
-    middle = inside.flatten(1).nanmedian(1).values.nan_to_num(0)[:, None, None]
-    shift = torch.where(inside.isnan(), middle, inside).round().long()
+    shift = torch.where(inside.isnan(), _middle(inside).nan_to_num(0), inside).round().long()
     columns = (torch.arange(people.shape[2], device=people.device) - shift).clamp(0, people.shape[2] - 1)
     moved = torch.zeros_like(disparity).scatter_reduce(2, columns, people.to(disparity.dtype), "amax")
     return window_max(moved, 1) > 0

@@ -11,8 +11,6 @@ Depth is metres along the left camera's z axis, NaN where there is no reading.
 import math
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -20,6 +18,8 @@ from torch.nn import functional as F
 
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.density import reading_density
+from torchpose.vision.disparity import bounding_box
+from torchpose.vision.pieces import connected_pieces
 from torchpose.vision.windows import window_max, window_min
 
 Plane = Float[Tensor, "height width"]
@@ -27,6 +27,7 @@ Planes = Float[Tensor, "batch height width"]
 Masks = Bool[Tensor, "batch height width"]
 # Half of the eight neighbours (rows, columns) of a pixel; the others are their opposites.
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
+UNCOUPLED = 100.0  # contrasts, across which the coupling is exactly 0 in float32 and in float64
 
 
 @dataclass(frozen=True)
@@ -132,17 +133,21 @@ def person_silhouette(
     mask, probability = torch.zeros_like(log_odds, dtype=torch.bool), torch.zeros_like(log_odds)
     # Depth cannot outvote log-odds below -depth_weight, so all else happens in the box of the pixels above.
     margin = config.agreement + config.sweeps + 2 * config.bridge + 1
-    for index in range(count):
-        rows, columns = _box(log_odds[index] > -config.depth_weight, margin)
-        box = (slice(index, index + 1), rows, columns)
-        evidence = log_odds[box] + _depth_evidence(
-            depth[box], background_depth[box[1:]], sigma[box[1:]], middle[box[:1]], config
-        )
-        field = mean_field(evidence, guide[box], config.coupling, config.contrast, config.sweeps)
-        probability[box] = field.sigmoid()
-        likely = field > 0
-        bridged = window_max(likely.to(field.dtype), config.bridge) > 0
-        mask[box] = _person_part(likely[0], bridged[0], evidence[0], previous[box][0], smallest, config)
+    inside = _boxes(log_odds > -config.depth_weight, margin)
+    if not inside.any():
+        return Silhouette(mask, probability)
+    # The box of all frames; within it, nothing reaches across the edge of a frame's own.
+    rows, columns = bounding_box(inside)
+    box, inside = (slice(None), rows, columns), inside[:, rows, columns]
+    evidence = log_odds[box] + _depth_evidence(
+        depth[box].where(inside, torch.nan), background_depth[box[1:]], sigma[box[1:]], middle, config
+    )
+    edged = guide[box].where(inside, -UNCOUPLED * config.contrast)
+    field = mean_field(evidence, edged, config.coupling, config.contrast, config.sweeps)
+    probability[box] = field.sigmoid() * inside
+    likely = (field > 0) & inside
+    bridged = (window_max(likely.to(field.dtype), config.bridge) > 0) & inside
+    mask[box] = _person_part(likely, bridged, evidence, previous[box], smallest, config)
     return Silhouette(mask, probability)
 
 
@@ -218,46 +223,43 @@ def _person_depth(log_odds: Planes, depth: Planes, limit: Plane) -> Float[Tensor
     return torch.where(votes.sum(1) > 0, (smooth.argmax(1) + 0.5) * step, torch.nan)
 
 
-def _box(wanted: Bool[Tensor, "height width"], margin: int) -> tuple[slice, slice]:
-    """Rows and columns of the wanted pixels, and `margin` more where the image goes on.
+def _boxes(wanted: Masks, margin: int) -> Masks:
+    """True in each image's bounding box of its wanted pixels, and `margin` more around; nowhere if there are none.
 
     Only of pixels whose four neighbours are wanted too: lone ones are noise, and do not survive the field.
     """
-    inner = wanted[1:-1, 1:-1] & wanted[:-2, 1:-1] & wanted[2:, 1:-1] & wanted[1:-1, :-2] & wanted[1:-1, 2:]
-    slices = []
-    for found in (inner.any(1), inner.any(0)):
-        index = found.nonzero()[:, 0].tolist() or [0]
-        slices.append(slice(max(0, index[0] + 1 - margin), index[-1] + 2 + margin))
-    return slices[0], slices[1]
+    inner = wanted[:, 1:-1, 1:-1] & wanted[:, :-2, 1:-1] & wanted[:, 2:, 1:-1]
+    inner = F.pad(inner & wanted[:, 1:-1, :-2] & wanted[:, 1:-1, 2:], (1, 1, 1, 1))
+    spans = []
+    for found in (inner.any(2), inner.any(1)):
+        size = found.shape[1]
+        place = torch.arange(size, device=wanted.device)
+        first = place.where(found, size).amin(1, keepdim=True) - margin
+        last = place.where(found, -1 - margin).amax(1, keepdim=True) + margin
+        spans.append((place >= first) & (place <= last))
+    return spans[0][:, :, None] & spans[1][:, None]
 
 
 def _person_part(
-    mask: Bool[Tensor, "height width"],
-    bridged: Bool[Tensor, "height width"],
-    log_odds: Plane,
-    previous: Bool[Tensor, "height width"],
-    min_area: int,
-    config: SilhouetteConfig,
-) -> Bool[Tensor, "height width"]:
-    """One part of `mask` that `bridged` connects, holes filled; empty if none has `min_area` px.
+    mask: Masks, bridged: Masks, log_odds: Planes, previous: Masks, min_area: int, config: SilhouetteConfig
+) -> Masks:
+    """One part of each `mask` that `bridged` connects, holes filled; empty if none has `min_area` px.
 
-    The part that shares most pixels with `previous`, or without any such the largest. By OpenCV, on the CPU: kornia's
-    union-find labels the same image in five times as long.
+    The part that shares most pixels with `previous`, or without any such the largest.
     """
-    _, labels = cv2.connectedComponents(bridged.cpu().numpy().astype(np.uint8), connectivity=8)
-    labels[~mask.cpu().numpy()] = 0
-    areas = np.bincount(labels.ravel())
-    areas[0] = 0
-    areas[areas < min_area] = 0
-    if not areas.any():
-        return torch.zeros_like(mask)
-    shared = np.bincount(labels[previous.cpu().numpy()], minlength=len(areas)) * (areas > 0)
-    chosen = shared.argmax() if shared.any() else areas.argmax()
-    person = labels == chosen
-    count, holes, stats, _ = cv2.connectedComponentsWithStats((~person).astype(np.uint8), connectivity=4)
-    total = np.bincount(holes.ravel(), weights=log_odds.cpu().numpy().ravel(), minlength=count)
-    left, top, width, height, area = stats.T
-    inside = (left > 0) & (top > 0) & (left + width < mask.shape[1]) & (top + height < mask.shape[0])
-    filled = inside & ((area <= config.max_hole * areas[chosen]) | (total > config.see_through * area))
-    filled[0] = True  # label 0 of the holes is the person
-    return torch.from_numpy(filled[holes]).to(mask.device)
+    parts = connected_pieces(bridged)
+    count = len(parts.area)
+    areas = torch.bincount(parts.labels[mask], minlength=count)
+    areas = areas.where(areas >= min_area, 0)
+    shared = torch.bincount(parts.labels[mask & previous], minlength=count).where(areas > 0, 0)
+    kept = parts.best(shared)
+    chosen = kept.where(kept > 0, parts.best(areas))
+    person = mask & (parts.labels == chosen[:, None, None]) & (chosen > 0)[:, None, None]
+    holes = connected_pieces(~person, connectivity=4)
+    total = torch.bincount(holes.labels.flatten(), log_odds.flatten().double(), minlength=len(holes.area))
+    left, top, width, height = holes.box.unbind(1)
+    inside = (left > 0) & (top > 0) & (left + width < mask.shape[2]) & (top + height < mask.shape[1])
+    small = holes.area <= config.max_hole * areas[chosen][holes.image]
+    filled = inside & (small | (total > config.see_through * holes.area))
+    filled[0] = True  # off the holes is the person
+    return filled[holes.labels]
