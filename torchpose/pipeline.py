@@ -27,6 +27,7 @@ from torchpose.recording import (
     readable_frames,
     spread_positions,
 )
+from torchpose.registration.colour import ColourConfig, ColourLikelihood
 from torchpose.registration.geodesic import geodesic_bounds, geodesic_term
 from torchpose.registration.likelihood import (
     AppearanceConfig,
@@ -97,6 +98,7 @@ class PoseConfig:
 
     body: BodyConfig = field(default_factory=BodyConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    colour: ColourConfig = field(default_factory=ColourConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     start: StartConfig = field(default_factory=StartConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -340,6 +342,9 @@ class StereoToPose(nn.Module):
         self.likelihoods = nn.ModuleList(
             [FaceLikelihood(names, config.appearance), TorsoLikelihood(names, config.appearance)]
         )
+        self.colour = ColourLikelihood(names, config.colour)
+        if config.colour.strength > 0:
+            self.likelihoods.append(self.colour)
         registrar = Registrar(self.body, config.registration)
         starter = Starter(self.body, config.start, config.registration)
         self.tracker = Tracker(self.body, config.tracking, registrar, starter)
@@ -352,9 +357,12 @@ class StereoToPose(nn.Module):
         """Where the computing happens."""
         return self.body.axes.device
 
+    def evidence(self, sight: Sight) -> Evidence:
+        return Evidence(sight.images, sight.silhouette, sight.cloud, sight.faces)
+
     def observe(self, sight: Sight) -> Observation:
         """A sight as registration takes it."""
-        evidence = Evidence(sight.images, sight.silhouette, sight.cloud, sight.faces)
+        evidence = self.evidence(sight)
         potential = appearance_potential(self.likelihoods, evidence, self.body.num_parts)
         geodesic = None
         if self.config.registration.labelling.geodesic > 0:
@@ -383,11 +391,26 @@ class StereoToPose(nn.Module):
         size = self.body.size_of_height(self.config.height or self.measure_height(sights))
         if self.config.size.rounds == 0:
             return size
-        seen = [(self.observe(sight), sight.faces) for sight in sights if sight.present]
-        found = [(observation, self.tracker.starter(observation, faces, size)) for observation, faces in seen]
-        found = [(observation, fit) for observation, fit in found if self.tracker.acceptable(fit)]
+        found, kept = [], []
+        for sight in sights:
+            if sight.present:
+                observation = self.observe(sight)
+                fit = self.tracker.starter(observation, sight.faces, size)
+                if self.tracker.acceptable(fit):
+                    found.append((observation, fit)), kept.append((sight, sight.faces))
         if not found:
             return size
+        self.colour.forget()
+        if self.config.colour.strength > 0:
+            for _ in range(2):
+                again = []
+                for (sight, _), (_, fit) in zip(kept, found, strict=True):
+                    self.colour.learn(self.evidence(sight), fit.belief, fit.distance)
+                for (sight, faces), (_, fit) in zip(kept, found, strict=True):
+                    observation = self.observe(sight)
+                    best = self.tracker.starter(observation, faces, size)
+                    again.append((observation, best))
+                found = again
         observation = stack_observations([observation for observation, _ in found])
         poses = torch.cat([fit.pose for _, fit in found])
         return fit_size(self.tracker.registrar, observation, poses, size, self.config.size)[0]
@@ -426,6 +449,8 @@ class StereoToPose(nn.Module):
         with self.stopwatch.measure("registration"):
             observation = self.observe(sight) if sight.present else None
             tracked = self.tracker(frame.time_s, observation, sight.faces, self.size, sight.cut)
+            if tracked.registration is not None and self.config.colour.strength > 0:
+                self.colour.learn(self.evidence(sight), tracked.registration.belief, tracked.registration.distance)
         return FramePose(frame.index, frame.time_s, tracked.status, tracked.registration, sight)
 
     def sequence(self, frames: list[FramePose]) -> PoseSequence:
