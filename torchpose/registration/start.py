@@ -3,7 +3,7 @@
 Left-camera frame, metres and radians.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import cos, pi, radians, sin
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchpose.body.model import BodyModel
 from torchpose.geometry import exp_rotation
 from torchpose.registration.labelling import LabellingConfig
+from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
 from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
 from torchpose.vision.faces import Faces
 from torchpose.vision.points import PointCloud
@@ -52,7 +53,8 @@ class StartConfig:
     refreshes: int = 1  # at the most
     face_yaws: tuple[float, ...] = (-75.0, -35.0, 0.0, 35.0, 75.0)  # degrees, tried when a face is seen
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
-    back_penalty: float = 0.004  # m of misfit that a pose turned away from the camera must make good
+    limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
+    back_penalty: float = 8.0  # nats that a pose turned away from the camera must make good
 
     def __post_init__(self) -> None:
         for name in ("points", "rounds", "final_rounds", "finalists"):
@@ -73,6 +75,7 @@ class Starter(nn.Module):
         # Far from the answer neighbours agree on wrong labels, and single points are many enough.
         alone = LabellingConfig(sweeps=0, potts=0.0)
         self.coarse = Registrar(body, replace(registration, labelling=alone))
+        self.limb_search = LimbSearch(body, self.coarse, config.limbs)
 
     def forward(
         self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
@@ -84,7 +87,7 @@ class Starter(nn.Module):
             if float(found.misfit) < self.config.good_misfit:
                 break
             better = self.refresh(observation, found.pose, size)
-            if not bool(better.misfit < found.misfit):
+            if not bool(better.score < found.score):
                 break
             found = better
         return found
@@ -96,7 +99,13 @@ class Starter(nn.Module):
         size: Float[Tensor, "#batch sizes"],
     ) -> Registration:
         """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
-        return self._search(observation, self.variations(pose), size, self.registrar.config.sigma_first)
+        few = _thin(observation, self.config.points)
+        limbs = self.limb_search(few, pose, size)
+        together = pose.clone()
+        for own, best in zip(self.limb_search.limbs, limbs[:, 0], strict=True):
+            together[:, own] = best[own]
+        starts = torch.cat([pose, together, limbs.flatten(0, 1)])
+        return self._search(observation, starts, size, self.registrar.config.sigma_first)
 
     def _search(
         self,
@@ -119,7 +128,7 @@ class Starter(nn.Module):
         return select(final, self._score(final).argmin())
 
     def _score(self, found: Registration) -> Float[Tensor, " starts"]:
-        return found.misfit + self.config.back_penalty * self._turned_away(found.pose)
+        return found.score.nan_to_num(nan=torch.inf) + self.config.back_penalty * self._turned_away(found.pose)
 
     def hypotheses(
         self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
@@ -141,23 +150,6 @@ class Starter(nn.Module):
         pelvis = pelvis + trunk * root[:, 1:2].sin() * back
         pelvis = pelvis - trunk * (1 - root[:, 1:2].cos()) * torch.tensor([0.0, 1.0, 0.0]).to(size)
         return self.body.pose_from_directions(pelvis, root, directions.repeat(Y, 1, 1))
-
-    def variations(self, pose: Float[Tensor, "1 parameters"]) -> Float[Tensor, "starts parameters"]:
-        """A pose, and that pose with one limb at a time in each of its other places."""
-        now = self.body.limb_directions(self.body(pose))
-        names = self.body.body_names[1:]
-        rows = [now]
-        for upper, lower, places in (("upper_arm", "forearm", ARMS), ("thigh", "shank", LEGS)):
-            for side, mirror in (("_left", 1.0), ("_right", -1.0)):
-                for place in places:
-                    row = now.clone()
-                    aim = torch.nn.functional.normalize(torch.tensor(place).to(row), dim=-1)
-                    aim = aim * torch.tensor([mirror, 1.0, 1.0]).to(row)
-                    row[0, names.index(upper + side)], row[0, names.index(lower + side)] = aim
-                    rows.append(row)
-        directions = torch.cat(rows)
-        root = pose.expand(len(directions), -1)
-        return self.body.pose_from_directions(root[:, :3], root[:, 3:6], directions)
 
     def _exchange(
         self,

@@ -43,7 +43,6 @@ class RegistrationConfig:
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
     rest_sd: float = 0.5  # rad, of the pull to the rest pose on joints of which nothing is seen; 0 is none
     rest_support: float = 5.0  # points on a limb that halve this pull
-    rest_penalty: float = 0.0004  # m of misfit per rad^2 off the rest pose: the more usual of two fits wins
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
     rim: RimConfig = field(default_factory=RimConfig)
@@ -54,7 +53,7 @@ class RegistrationConfig:
         for name in ("sigma_first", "sigma_last", "noise_sd", "effective_points", "rest_support"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("outlier", "robust_sd", "rest_sd", "rest_penalty", "tangential"):
+        for name in ("outlier", "robust_sd", "rest_sd", "tangential"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
 
@@ -99,7 +98,8 @@ class Registration:
     ]  # q(label) of each point; the last label is "no part" where there is one
     distance: Float[Tensor, "batch num"]  # m, to the nearest part; 0 on padding
     point_to_model: Float[Tensor, " batch"]  # m, (5.2): the mean of `distance` over the points
-    misfit: Float[Tensor, " batch"]  # m, capped distances plus overhang plus `rest_penalty`: compares starts
+    misfit: Float[Tensor, " batch"]  # m, capped distances plus overhang: whether this can be the person at all
+    score: Float[Tensor, " batch"]  # minus the log of the joint density, up to a constant: compares starts, less is better
     bound: Float[Tensor, "rounds batch"]  # (C.8) after each VE-step, at that round's sigma
     status: Int[Tensor, " batch"]  # of the last M-step, see `Status`
 
@@ -189,6 +189,9 @@ class Registrar(nn.Module):
             rows = Rows.cat(rows, across)
         return rows, belief.sum(2)
 
+    def _point_row_count(self, cloud: PointCloud) -> int:
+        return 3 * cloud.mask.shape[1] * (1 if self.config.hard else self.body.num_parts)
+
     def _point_rows(
         self, posed: PosedBody, foot: FootPoint, belief: Float[Tensor, "batch parts num"], cloud: PointCloud
     ) -> Rows:
@@ -250,7 +253,7 @@ class Registrar(nn.Module):
         labelling = self.label(posed, foot, observation, config.sigma_last)
         rows, support = self.rows(posed, foot, labelling, observation)
         full = self.with_rest(prior, support)
-        _, jacobian = linearize_by_screws(self.body, size, rows, full, config.fitting)(pose)
+        residual, jacobian = linearize_by_screws(self.body, size, rows, full, config.fitting)(pose)
         information = jacobian.mT @ jacobian
         factor, failed = torch.linalg.cholesky_ex(information)
         known = (failed == 0)[:, None, None]
@@ -259,12 +262,14 @@ class Registrar(nn.Module):
         covariance = torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.distance.amin(1) * cloud.mask
+        # Of the residuals the points' come first; the bound stands in for them, with every label and none.
+        others = residual[:, self._point_row_count(cloud) :]
+        score = 0.5 * others.square().sum(1) - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
         misfit = nearest.clamp_max(0.2).sum(1) / count
-        misfit = misfit + config.rest_penalty * ((pose[:, 6:] - self.body.rest) ** 2).sum(1)
         if config.rim.weight > 0:
             misfit = misfit + overhang(posed, observation.nearest, observation.camera, config.rim)
         return Registration(
-            pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, bound, status
+            pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
         )
 
 

@@ -40,7 +40,7 @@ class TrackingConfig:
     accept_misfit: float = 0.055  # m: a pose that fits worse is none
     doubt_misfit: float = 0.030  # m: a worse fit is also sought anew, and a clearly better one taken
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
-    stray_share: float = 0.03  # of the points straying: a limb may be lost, and is sought elsewhere
+    stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
     memory: float = 2.0  # s after which a lost person is forgotten
 
@@ -86,6 +86,7 @@ class Tracker(nn.Module):
         self._velocity: Tensor | None = None  # per second
         self._time = 0.0
         self._known_stray = 0.0
+        self._searched = -math.inf
         self._failed = -math.inf  # when a search last found nothing, s
 
     def state(self) -> dict[str, Tensor]:
@@ -141,11 +142,14 @@ class Tracker(nn.Module):
         found = self._follow(observation, size, time_s)
         stray = self._stray(found)
         # Points that stayed without a part after a search (a bag, a skirt) are no reason for another one.
-        if stray > max(self.config.stray_share, 1.5 * self._known_stray) or not self.acceptable(found):
+        if self._in_doubt(found, stray, time_s):
             # First the limbs: where one moved too fast to follow, its points are there without a part.
             better = self.starter.refresh(observation, found.pose, size)
-            if bool(is_finite(better)[0]) and bool(better.misfit < found.misfit):
+            print('SEARCH',time_s,'stray',stray,'known',self._known_stray,'score',float(found.score),float(better.score),'stray after',self._stray(better))
+            if bool(is_finite(better)[0]) and bool(better.score < found.score):
                 found = better
+            else:
+                self._searched = time_s
             self._known_stray = self._stray(found)
         else:
             self._known_stray = min(self._known_stray, stray)
@@ -173,11 +177,19 @@ class Tracker(nn.Module):
         starts = torch.cat([predicted, self._pose])
         prior = PosePrior(predicted.expand_as(starts), (sd**-2).expand_as(starts))
         both = self.registrar(observation, starts, size, prior)
-        return select(both, both.misfit.argmin())
+        return select(both, both.score.nan_to_num(nan=torch.inf).argmin())
+
+    def _in_doubt(self, found: Registration, stray: float, time_s: float) -> bool:
+        if not self.acceptable(found):
+            return True
+        waited = time_s - self._searched >= self.config.retry
+        return stray > self.config.stray_share and (waited or stray > 1.5 * self._known_stray)
 
     def _stray(self, found: Registration) -> float:
-        """Share of the points that lie far from the model."""
+        """Share of the points that are believed to be of no part."""
         points = (found.distance > 0).sum().clamp_min(1)
+        if found.belief.shape[1] > self.body.num_parts:
+            return float(found.belief[0, -1].sum() / points)
         return float((found.distance > self.config.stray_distance).sum() / points)
 
     def acceptable(self, found: Registration) -> bool:
