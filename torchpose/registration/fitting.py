@@ -16,11 +16,14 @@ from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import (
     Linearize,
     LMConfig,
+    NormalEquations,
     Residual,
     Solution,
-    levenberg_marquardt,
     linearize_by_autograd,
+    minimize,
+    normal_equations,
 )
+from torchpose.registration.moment import MomentEquations, sum_rows
 
 
 class JacobianKind(Enum):
@@ -78,14 +81,41 @@ def fit_pose(
     rows: Rows,
     prior: PosePrior,
     config: FittingConfig,
+    posed: PosedBody | None = None,
 ) -> Solution:
-    """The pose that minimises the rows' squares, the prior's and those of broken limits, from `start`."""
-    residual = pose_residual(body, size, rows, prior, config)
+    """The pose that minimises the rows' squares, the prior's and those of broken limits, from `start`.
+
+    `posed` is the body at `start`, if it is at hand.
+    """
     if config.jacobian is JacobianKind.autograd:
-        linearize = linearize_by_autograd(residual)
+        equations = normal_equations(linearize_by_autograd(pose_residual(body, size, rows, prior, config)))
     else:
-        linearize = linearize_by_screws(body, size, rows, prior, config)
-    return levenberg_marquardt(linearize, start, config.lm)
+        posed = body(start, size) if posed is None else posed
+        equations = equations_by_moments(body, size, rows, prior, config, posed)
+    return minimize(equations, start, config.lm)
+
+
+def equations_by_moments(
+    body: BodyModel,
+    size: Float[Tensor, "#batch sizes"],
+    rows: Rows,
+    prior: PosePrior,
+    config: FittingConfig,
+    posed: PosedBody,
+) -> NormalEquations:
+    """The normal equations of rows, prior and limits; the rows are summed once, near where the body is `posed`."""
+    residual = (rows.direction * (rows.target - rows.points(posed))).sum(-1)
+    moments = sum_rows(rows.part, rows.local, rows.direction, residual, posed)
+    of_rows = MomentEquations(moments, body.part_moves)
+
+    def equations(pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        residual, jacobian = _pose_terms(body, pose, prior, config)
+        columns = torch.cat([jacobian, residual[..., None]], 2)
+        whole = torch.baddbmm(of_rows(body(pose, size)), columns.mT, columns)
+        # Where the sum of squares is 0 its terms still cancel only up to rounding.
+        return 0.5 * whole[:, -1, -1].clamp_min(0), whole[:, :-1, -1], whole[:, :-1, :-1]
+
+    return equations
 
 
 def pose_residual(
@@ -96,7 +126,7 @@ def pose_residual(
     def residual(pose: Tensor) -> Tensor:
         posed = body(pose, size)
         gap = rows.target - rows.points(posed)
-        return torch.cat([(rows.direction * gap).sum(-1), *_pose_terms(body, pose, prior, config)], 1)
+        return torch.cat([(rows.direction * gap).sum(-1), _pose_terms(body, pose, prior, config)[0]], 1)
 
     return residual
 
@@ -111,7 +141,6 @@ def linearize_by_screws(
     move are masked.
     """
     moves = body.part_moves.to(rows.direction)[rows.part]  # (B, R, P)
-    slope = prior.precision.sqrt()
 
     def linearize(pose: Tensor) -> tuple[Tensor, Tensor]:
         posed = body(pose, size)
@@ -120,21 +149,23 @@ def linearize_by_screws(
         turning = torch.cat([posed.screw_axes, torch.linalg.cross(posed.screw_origins, posed.screw_axes)], -1)
         sliding = torch.cat([torch.zeros_like(posed.screw_axes), posed.screw_axes], -1)
         screws = torch.cat([sliding[:, :3], turning[:, 3:]], 1)
-        residual = torch.cat(
-            [(rows.direction * (rows.target - points)).sum(-1), *_pose_terms(body, pose, prior, config)], 1
-        )
-        jacobian = [-(wrench @ screws.mT) * moves, torch.diag_embed(slope)]
-        if config.limit_sd > 0:
-            outside = (pose < body.low) | (pose > body.high)
-            jacobian.append(torch.diag_embed(outside.to(pose) / config.limit_sd))
-        return residual, torch.cat(jacobian, 1)
+        residual, jacobian = _pose_terms(body, pose, prior, config)
+        gap = (rows.direction * (rows.target - points)).sum(-1)
+        return torch.cat([gap, residual], 1), torch.cat([-(wrench @ screws.mT) * moves, jacobian], 1)
 
     return linearize
 
 
-def _pose_terms(body: BodyModel, pose: Tensor, prior: PosePrior, config: FittingConfig) -> list[Tensor]:
-    terms = [prior.precision.sqrt() * (pose - prior.mean)]
+def _pose_terms(
+    body: BodyModel, pose: Tensor, prior: PosePrior, config: FittingConfig
+) -> tuple[Float[Tensor, "batch terms"], Float[Tensor, "batch terms parameters"]]:
+    """Residuals of the prior and of broken limits, and their Jacobian."""
+    # The root of 0 has no derivative.
+    silent = prior.precision == 0
+    slopes = [torch.where(silent, 1.0, prior.precision).sqrt() * ~silent]
+    residuals = [slopes[0] * (pose - prior.mean)]
     if config.limit_sd > 0:
-        over = (pose - body.high).clamp_min(0) - (body.low - pose).clamp_min(0)
-        terms.append(over / config.limit_sd)
-    return terms
+        over = pose - torch.minimum(torch.maximum(pose, body.low), body.high)
+        slopes.append((over != 0).to(pose) / config.limit_sd)
+        residuals.append(over / config.limit_sd)
+    return torch.cat(residuals, 1), torch.cat([torch.diag_embed(slope) for slope in slopes], 1)
