@@ -129,6 +129,37 @@ def normal_equations(linearize: Linearize) -> NormalEquations:
     return equations
 
 
+def implicit_value(equations: NormalEquations, solution: Solution) -> Float[Tensor, "batch unknowns"]:
+    """`solution.value`, differentiable in whatever the closed form `equations` was built from.
+
+    At a minimum the gradient g(x, theta) is 0, so dx / d theta = -H^-1 dg / d theta with H = dg / dx, the loss's
+    exact Hessian (the implicit function theorem): the steps that led there are neither kept nor differentiated, and
+    H is made and factored in the backward pass only. Of a row that stopped short of the minimum this is the derivative
+    of a Newton step from there; one whose H is not positive definite gets 0.
+
+    `equations` must be finite in all rows. Differentiable once: a second derivative raises RuntimeError.
+    """
+    x = solution.value.detach().requires_grad_()
+    _, gradient, _ = equations(x)
+
+    def solve(cotangent: Tensor | None) -> Tensor | None:
+        if cotangent is None:
+            return None
+        if torch.is_grad_enabled():
+            raise RuntimeError("the value of a fit can be differentiated once: leave out create_graph=True")
+        P = x.shape[1]
+        unit = torch.eye(P, dtype=x.dtype, device=x.device)[:, None].expand(P, *x.shape)
+        (hessian,) = torch.autograd.grad(gradient, x, unit, retain_graph=True, is_grads_batched=True)
+        factor, failed = torch.linalg.cholesky_ex(hessian.transpose(0, 1))
+        minimum = (failed == 0)[:, None]
+        factor = torch.where(minimum[..., None], factor, unit.transpose(0, 1))
+        return torch.where(minimum, -torch.cholesky_solve(cotangent[..., None], factor)[..., 0], 0.0)
+
+    gap = gradient - gradient.detach()  # 0: only its derivative counts
+    gap.register_hook(solve)
+    return x.detach() + gap
+
+
 def linearize_by_autograd(residual: Residual) -> Linearize:
     """Residuals and Jacobian of a residual function by forward-mode differentiation: the reference.
 

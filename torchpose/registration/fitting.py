@@ -5,11 +5,12 @@ which their difference counts. Metres; a direction is divided by the row's stand
 have no unit.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import TypeVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.body.model import BodyModel, PosedBody
@@ -19,6 +20,8 @@ from torchpose.least_squares import (
     NormalEquations,
     Residual,
     Solution,
+    Status,
+    implicit_value,
     linearize_by_autograd,
     minimize,
     normal_equations,
@@ -74,6 +77,9 @@ class PosePrior:
     precision: Float[Tensor, "batch parameters"]
 
 
+Given = TypeVar("Given", Rows, PosePrior)
+
+
 def fit_pose(
     body: BodyModel,
     start: Float[Tensor, "batch parameters"],
@@ -85,8 +91,55 @@ def fit_pose(
 ) -> Solution:
     """The pose that minimises the rows' squares, the prior's and those of broken limits, from `start`.
 
-    `posed` is the body at `start`, if it is at hand.
+    The answer's `value` is differentiable in the rows, the size and the prior, not in the start, by the implicit
+    function theorem (see `implicit_value`: nothing of the steps is kept, and nothing is done where no gradient is asked
+    for). Rows with status NON_FINITE get gradients of 0, rows out of steps those of a Newton step from where they
+    stopped.
+
+    Args:
+        start: where to begin.
+        size: of each person, or of the one.
+        posed: the body at `start`, if it is at hand.
     """
+    with torch.no_grad():
+        solution = _minimize(body, start, size, rows, prior, config, posed)
+    inputs = (size, *_floats(rows).values(), *_floats(prior).values())
+    if not (torch.is_grad_enabled() and any(x.requires_grad for x in inputs)):
+        return solution
+    # A broken row would turn its zeros into NaN on the way back.
+    sound = solution.status != int(Status.NON_FINITE)
+    value = torch.where(sound[:, None], solution.value, 0.0)
+    size = torch.where(sound[:, None], size, 1.0)
+    rows, prior = _silenced(rows, ~sound), _silenced(prior, ~sound)
+    with torch.no_grad():
+        posed = body(value, size)
+    equations = equations_by_moments(body, size, rows, prior, config, posed)
+    value = implicit_value(equations, replace(solution, value=value))
+    return replace(solution, value=torch.where(sound[:, None], value, solution.value))
+
+
+def _floats(data: Rows | PosePrior) -> dict[str, Tensor]:
+    values = {name: getattr(data, name) for name in data.__dataclass_fields__}
+    return {name: x for name, x in values.items() if isinstance(x, Tensor) and x.is_floating_point()}
+
+
+def _silenced(data: Given, where: Bool[Tensor, " batch"]) -> Given:
+    """With zeros, which say nothing, for some of the batch."""
+    quiet = {
+        name: torch.where(where.view(-1, *[1] * (x.ndim - 1)), 0.0, x) for name, x in _floats(data).items()
+    }
+    return replace(data, **quiet)
+
+
+def _minimize(
+    body: BodyModel,
+    start: Tensor,
+    size: Tensor,
+    rows: Rows,
+    prior: PosePrior,
+    config: FittingConfig,
+    posed: PosedBody | None,
+) -> Solution:
     if config.jacobian is JacobianKind.autograd:
         equations = normal_equations(linearize_by_autograd(pose_residual(body, size, rows, prior, config)))
     else:
