@@ -86,7 +86,7 @@ def test_depth_is_where_each_ray_first_meets_a_shape(drawn):
 
 
 def test_depth_agrees_with_the_renderer_of_images(drawn):
-    display, posed, frames = drawn
+    _, posed, frames = drawn
     person = Person(height=1.7, girths=(1.1, 0.9, 1.0, 1.05, 0.95, 1.0))
     rendered = StereoRenderer(SMALL, BODY, person)(posed)
     assert torch.equal(rendered.labels, frames.labels)
