@@ -112,30 +112,23 @@ def place(
     generator: torch.Generator,
 ) -> Float[Tensor, "time parameters"]:
     """The performance moved, as a whole, to where the camera sees all of it: 3 to 4 m away, or as far as need be."""
-    low, high = _extent(body(pose, size))
-    aside, distance = torch.rand(2, generator=generator).tolist()
-    edges = torch.tensor([[CAMERA.width, CAMERA.height]]) / 2 - 8  # px, from the middle of the image
-    half = (high.amax(0) - low.amin(0))[
-        :2
-    ] / 2 + 0.03  # m: super-quadrics reach a little further than spheroids
-    nearest = low[:, 2].amin()
-    fits = (half * CAMERA.focal_length / edges).amax() - nearest
-    # The principal point is not the image's middle.
-    z = max(NEAR + (FAR - NEAR) * distance, float(fits))
-    off = z + nearest
-    middle = (high.amax(0) + low.amin(0))[:2] / 2
-    center = torch.tensor([(CAMERA.width - 1) / 2 - CAMERA.cx, (CAMERA.height - 1) / 2 - CAMERA.cy])
-    spare = (edges[0] * off / CAMERA.focal_length - half).clamp(0, 0.2)
-    goal = center * off / CAMERA.focal_length + spare * (2 * aside - 1) * torch.tensor([1.0, 0.0])
-    shift = torch.cat([goal - middle, torch.tensor([z])])
-    return torch.cat([pose[:, :3] + shift, pose[:, 3:]], 1)
-
-
-def _extent(posed: PosedBody) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
-    """The corners of the box about all spheroids, in the camera's frame."""
+    posed = body(pose, size)
     across, along = posed.radii.unbind(-1)
-    half = (posed.frames * torch.stack((across, across, along), -1)[:, :, None]).norm(dim=-1)
-    return (posed.centers - half).amin(1), (posed.centers + half).amax(1)
+    # The box about each spheroid; super-quadrics reach a little further.
+    half = (posed.frames * torch.stack((across, across, along), -1)[:, :, None]).norm(dim=-1) + 0.03
+    low, high = posed.centers - half, posed.centers + half
+    middle = (low.amin((0, 1)) + high.amax((0, 1)))[:2] / 2
+    reach = torch.maximum(high[..., :2] - middle, middle - low[..., :2])
+    edge = torch.tensor([CAMERA.width / 2, CAMERA.height / 2]) - 4  # px, from the image's middle
+    aside, share = torch.rand(2, generator=generator).tolist()
+    fits = (reach * CAMERA.focal_length / edge - low[..., 2:]).amax()
+    distance = max(NEAR + (FAR - NEAR) * share, float(fits))
+    spare = (edge * (distance + low[..., 2:]) / CAMERA.focal_length - reach)[..., 0].amin().clamp(0, 0.15)
+    # The principal point is not the image's middle.
+    off = torch.tensor([(CAMERA.width - 1) / 2 - CAMERA.cx, (CAMERA.height - 1) / 2 - CAMERA.cy])
+    goal = off * distance / CAMERA.focal_length - middle
+    shift = torch.stack([goal[0] + (2 * aside - 1) * spare, goal[1], torch.tensor(distance)])
+    return torch.cat([pose[:, :3] + shift, pose[:, 3:]], 1)
 
 
 @torch.no_grad()
