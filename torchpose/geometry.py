@@ -19,7 +19,9 @@ def hat(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 # sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 as series in -t^2: 1 / (2k + 1)!, 1 / (2k + 2)! and 1 / (2k + 3)!.
-SERIES = tuple(tuple(1 / factorial(2 * k + n) for n in (1, 2, 3)) for k in range(4))
+SERIES = torch.tensor([[1 / factorial(2 * k + n) for n in (1, 2, 3)] for k in range(4)], dtype=torch.float64)
+# v @ GENERATORS are the nine entries of hat(v): one product in the place of nine small operations.
+GENERATORS = hat(torch.eye(3)).flatten(1)
 
 
 def _sinc_terms(theta2: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
@@ -31,10 +33,9 @@ def _sinc_terms(theta2: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
     theta = square.sqrt()
     sine, half = theta.sin(), (0.5 * theta).sin()
     far = torch.stack([sine / theta, 2 * half * half / square, (theta - sine) / (square * theta)], -1)
-    series = theta2.new_tensor(SERIES)
-    near = series[3]
-    for coefficients in series[:3].flip(0):
-        near = coefficients - theta2[..., None] * near
+    first, second, third, near = SERIES.to(theta2).unbind()
+    for coefficients in (third, second, first):
+        near = torch.addcmul(coefficients, theta2[..., None], near, value=-1)
     return torch.where(small[..., None], near, far)
 
 
@@ -43,10 +44,10 @@ def rotation_and_left_jacobian(
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]]:
     """`exp_rotation` and `left_jacobian` of the same vectors, for the price of one."""
     a, b, c = _sinc_terms((vector * vector).sum(-1))[..., None, None].unbind(-3)
-    skew = hat(vector)
+    skew = (vector @ GENERATORS.to(vector)).unflatten(-1, (3, 3))
     square = skew @ skew
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return eye + a * skew + b * square, eye + b * skew + c * square
+    return torch.addcmul(eye + a * skew, b, square), torch.addcmul(eye + b * skew, c, square)
 
 
 def exp_rotation(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

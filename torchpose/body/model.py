@@ -65,6 +65,7 @@ class BodyModel(nn.Module):
     # their bodies', and radii.
     size_basis: Tensor
     segment_frames: Tensor  # (K, 3, 3) columns: the spheroid's axes in its body
+    bottom: Tensor  # (6,) the last row of a body's place in its parent
     by_depth: Tensor  # (J,) the bodies but for the root, by their depth in the tree
     above: Tensor  # (J,) where among root and `by_depth` the parent of each of these is
     places: Tensor  # (bodies,) where among them each body is
@@ -176,6 +177,7 @@ class BodyModel(nn.Module):
             radii,
         ]
         self.size_counts = [len(table.flatten(0, 1)) for table in tables]
+        self._constant("bottom", torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
         self._constant("size_basis", torch.cat([table.flatten(0, 1) for table in tables]).mT)
         long_axis = torch.tensor([segment.axis for segment in skeleton.segments])
         up = torch.tensor([0.0, 0.0, 1.0]).expand_as(long_axis)
@@ -206,7 +208,7 @@ class BodyModel(nn.Module):
         )
         root, root_axes, local, axes = self._turns(pose)
         # Each body as (R, t, axes of its joint), 3 x 6: the parent's (R, t) times (local; 0 0 0 1 0 0) places it.
-        bottom = shift.new_tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]).expand(B, len(self.parents), 1, 6)
+        bottom = self.bottom.expand(B, len(self.parents), 1, 6)
         step = torch.cat([torch.cat([local, shift[..., None], axes.mT], -1), bottom], -2)
         step = step.index_select(1, self.by_depth)
         placed = torch.cat([root, pose[:, :3, None], torch.zeros_like(root[..., :2])], -1)[:, None]

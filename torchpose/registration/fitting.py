@@ -187,26 +187,37 @@ def pose_residual(
 def linearize_by_screws(
     body: BodyModel, size: Float[Tensor, "#batch sizes"], rows: Rows, prior: PosePrior, config: FittingConfig
 ) -> Linearize:
-    """The same residuals with their Jacobian in closed form: rows are (p x n, n) against each joint's screw.
+    """The same residuals with their Jacobian in closed form."""
+
+    def linearize(pose: Tensor) -> tuple[Tensor, Tensor]:
+        return linearize_posed(body, pose, body(pose, size), rows, prior, config)
+
+    return linearize
+
+
+def linearize_posed(
+    body: BodyModel,
+    pose: Float[Tensor, "batch parameters"],
+    posed: PosedBody,
+    rows: Rows,
+    prior: PosePrior,
+    config: FittingConfig,
+) -> tuple[Float[Tensor, "batch residuals"], Float[Tensor, "batch residuals parameters"]]:
+    """Residuals and Jacobian at one pose, with the body `posed` there: (p x n, n) of a row against each screw.
 
     With the screw S = (w, o x w) of an axis w through o, n . (w x (p - o)) = (p x n, n) . S; a translation
     along w is the screw (0, w). One product serves all rows and joints; rows of parts that a joint does not
     move are masked.
     """
-    moves = body.part_moves.to(rows.direction)[rows.part]  # (B, R, P)
-
-    def linearize(pose: Tensor) -> tuple[Tensor, Tensor]:
-        posed = body(pose, size)
-        points = rows.points(posed)
-        wrench = torch.cat([torch.linalg.cross(points, rows.direction), rows.direction], -1)
-        turning = torch.cat([posed.screw_axes, torch.linalg.cross(posed.screw_origins, posed.screw_axes)], -1)
-        sliding = torch.cat([torch.zeros_like(posed.screw_axes), posed.screw_axes], -1)
-        screws = torch.cat([sliding[:, :3], turning[:, 3:]], 1)
-        residual, jacobian = _pose_terms(body, pose, prior, config)
-        gap = (rows.direction * (rows.target - points)).sum(-1)
-        return torch.cat([gap, residual], 1), torch.cat([-(wrench @ screws.mT) * moves, jacobian], 1)
-
-    return linearize
+    points = rows.points(posed)
+    wrench = torch.cat([torch.linalg.cross(points, rows.direction), rows.direction], -1)
+    turning = torch.cat([posed.screw_axes, torch.linalg.cross(posed.screw_origins, posed.screw_axes)], -1)
+    sliding = torch.cat([torch.zeros_like(posed.screw_axes), posed.screw_axes], -1)
+    screws = torch.cat([sliding[:, :3], turning[:, 3:]], 1)
+    moves = body.part_moves.to(wrench)[rows.part]  # (B, R, P)
+    residual, jacobian = _pose_terms(body, pose, prior, config)
+    gap = (rows.direction * (rows.target - points)).sum(-1)
+    return torch.cat([gap, residual], 1), torch.cat([-(wrench @ screws.mT) * moves, jacobian], 1)
 
 
 def _pose_terms(
