@@ -13,8 +13,11 @@ from benchmarks.recovery import Bench, Trial, is_right, main, plain, tally, turn
 from benchmarks.simulated import Take, simulate
 from torchpose.body.model import BodyModel
 from torchpose.cli import load_config
+from torchpose.pipeline import FramePose
+from torchpose.recording import Frame
 from torchpose.registration.vem import Registration, RegistrationConfig
 from torchpose.synthesis.motion import random_stream
+from torchpose.tracking.tracker import TrackStatus
 
 BODY = BodyModel()
 JOINT = {name: i for i, name in enumerate(BODY.joint_names)}
@@ -158,6 +161,29 @@ def test_the_tracker_is_followed_until_its_pose_is_right(take: Take):
     assert len(trials) == 1
     assert trials[0].right == (True,)
     assert trials[0].status in (("tracked",), ("recovered",))
+
+
+def test_a_tracker_that_is_lost_at_first_gets_more_frames(take: Take, monkeypatch: pytest.MonkeyPatch):
+    bench = Bench(take, CONFIG)
+    bench.model.size = take.size
+    away = take.pose + torch.tensor([0.3] + 23 * [0.0])
+    answers = {
+        1: (TrackStatus.tracked, Knows(away[1:2], 0.01)),
+        2: (TrackStatus.lost, None),
+        3: (TrackStatus.recovered, Knows(take.pose[3:4], 0.01)),
+    }
+
+    def follow(frame: Frame) -> FramePose:
+        status, fit = answers[frame.index]
+        return FramePose(frame.index, frame.time_s, status, None if fit is None else fit(), None)
+
+    monkeypatch.setattr(bench.model, "follow", follow)
+    (trial,) = bench.tracked("45 degrees, tracker", take.pose[1:2], [1])
+    assert trial.right == (False, False, True)
+    assert trial.doubted == (False, True, True)
+    assert trial.status == ("tracked", "lost", "recovered")
+    figures = tally([trial])
+    assert (figures["at_once"], figures["recovered"], figures["frames"], figures["known"]) == (0, 1, 3, 0.5)
 
 
 def test_another_body_takes_the_same_pose(take: Take):
