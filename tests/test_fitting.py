@@ -220,6 +220,98 @@ def test_a_batch_equals_one_by_one():
         )
 
 
+CONVERGED = LMConfig(max_steps=200, step_tolerance=1e-12, loss_tolerance=0.0)
+
+
+def noisy_problem(batch=2):
+    """Rows 3 cm off: the residuals' own curvature counts, so J^T J is not the Hessian. Some limits are broken."""
+    body = body_of()
+    truth, size = random_pose(body, batch, 0.4), random_size(body)
+    rows = rows_of(body, truth, size, per_part=4, noise=0.03)
+    rows = replace(rows, direction=20 * rows.direction)
+    prior = PosePrior(truth + 0.05 * torch.randn_like(truth), 20 + 20 * torch.rand_like(truth))
+    return body, truth + 0.05 * torch.randn_like(truth), size, rows, prior
+
+
+def answer(body, start, config, part, *inputs):
+    local, target, direction, size, mean, precision = inputs
+    return fit_pose(
+        body, start, size, Rows(part, local, target, direction), PosePrior(mean, precision), config
+    )
+
+
+def inputs_of(rows, size, prior):
+    tensors = (rows.local, rows.target, rows.direction, size, prior.mean, prior.precision)
+    return [x.detach().clone().requires_grad_() for x in tensors]
+
+
+def test_the_answer_is_differentiable_in_all_that_it_rests_on():
+    """gradcheck: central differences of whole fits, from the start to the minimum. The fit's own rounding, 1e-8 rad,
+    is what limits them."""
+    body, start, size, rows, prior = noisy_problem()
+    config = FittingConfig(lm=CONVERGED, limit_sd=0.2)
+    solution = fit_pose(body, start, size, rows, prior, config)
+    assert ((solution.value < body.low) | (solution.value > body.high)).any()
+    inputs = inputs_of(rows, size, prior)
+
+    def value(*inputs):
+        return answer(body, start, config, rows.part, *inputs).value
+
+    assert torch.equal(value(*inputs), solution.value)
+    assert torch.autograd.gradcheck(
+        value, inputs, eps=3e-5, atol=2e-3, rtol=2e-3, fast_mode=True, nondet_tol=1e-12
+    )
+    # Each input alone, along a random direction.
+    gradient = torch.autograd.grad(value(*inputs).sum(), inputs)
+    for i, (x, slope) in enumerate(zip(inputs, gradient, strict=True)):
+        way = torch.randn_like(x)
+        both = []
+        for h in (5e-4, -5e-4):
+            moved = [y.detach() + h * way if i == j else y.detach() for j, y in enumerate(inputs)]
+            both.append(value(*moved).sum())
+        assert float((both[0] - both[1]) / 1e-3) == pytest.approx(
+            float((slope * way).sum()), rel=2e-3, abs=1e-4
+        )
+
+
+def test_no_gradient_asked_for_means_no_graph():
+    body, start, size, rows, prior = noisy_problem()
+    inputs = inputs_of(rows, size, prior)
+    asked = answer(body, start, PATIENT, rows.part, *inputs)
+    with torch.no_grad():
+        silent = answer(body, start, PATIENT, rows.part, *inputs)
+    assert asked.value.requires_grad
+    assert not silent.value.requires_grad
+    assert not fit_pose(body, start.requires_grad_(), size, rows, prior, PATIENT).value.grad_fn
+    assert torch.equal(asked.value, silent.value)
+
+
+def test_a_broken_row_has_no_gradient_and_leaves_the_others_theirs():
+    body, start, size, rows, prior = noisy_problem(3)
+    size = size.expand(3, -1)
+    config = FittingConfig(lm=LMConfig(max_steps=3))  # out of steps
+    whole = inputs_of(rows, size, prior)
+    answer(body, start, config, rows.part, *whole).value.sum().backward()
+    for index, entry in (
+        (0, (1, 3, 0)),
+        (1, (1, 3, 1)),
+        (2, (1, 5, 2)),
+        (3, (1, 4)),
+        (4, (1, 9)),
+        (5, (1, 9)),
+    ):
+        broken = inputs_of(rows, size, prior)
+        with torch.no_grad():
+            broken[index][entry] = torch.nan
+        solution = answer(body, start, config, rows.part, *broken)
+        assert solution.status.tolist() == [Status.MAX_STEPS, Status.NON_FINITE, Status.MAX_STEPS]
+        solution.value.sum().backward()
+        for mine, theirs in zip(broken, whole, strict=True):
+            assert (mine.grad[1] == 0).all()
+            assert mine.grad[[0, 2]].any()
+            assert_close(mine.grad[[0, 2]], theirs.grad[[0, 2]], atol=1e-12, rtol=1e-9)
+
+
 def test_rows_join_in_order():
     body = body_of()
     pose = random_pose(body)

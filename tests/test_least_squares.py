@@ -14,9 +14,13 @@ from torchpose.least_squares import (
     Linearize,
     LMConfig,
     Residual,
+    Solution,
     Status,
+    implicit_value,
     levenberg_marquardt,
     linearize_by_autograd,
+    minimize,
+    normal_equations,
 )
 
 F64 = torch.float64
@@ -296,3 +300,67 @@ class TestLinearizeByAutograd:
         _, jacobian = linearize_by_autograd(mix)(x)
         for row in range(3):
             assert_close(jacobian[row], torch.func.jacrev(lambda y: mix(y[None])[0])(x[row]))
+
+
+class TestImplicitValue:
+    """Derivatives of the answer in what the problem was built from, by the implicit function theorem."""
+
+    def test_a_linear_problem_has_lstsqs_derivative(self) -> None:
+        A, b = torch.randn(3, 9, 4, dtype=F64), torch.randn(3, 9, dtype=F64)
+
+        def ours(A: Tensor, b: Tensor) -> Tensor:
+            equations = normal_equations(lambda x: ((A @ x[..., None])[..., 0] - b, A))
+            with torch.no_grad():
+                solution = minimize(equations, torch.zeros(3, 4, dtype=F64), LONG)
+            return implicit_value(equations, solution)
+
+        inputs = A.requires_grad_(), b.requires_grad_()
+        weight = torch.randn(3, 4, dtype=F64)
+        got = torch.autograd.grad((weight * ours(*inputs)).sum(), inputs)
+        expected = torch.autograd.grad((weight * (torch.linalg.pinv(A) @ b[..., None])[..., 0]).sum(), inputs)
+        for one, other in zip(got, expected, strict=True):
+            assert_close(one, other, atol=1e-8, rtol=1e-8)
+
+    def test_large_residuals_need_the_exact_hessian(self) -> None:
+        """x near the curve (x, x^2): the nearest point to a target far off it, where J^T J is half of the Hessian."""
+
+        def nearest(target: Tensor) -> Tensor:
+            def linearize(x: Tensor) -> tuple[Tensor, Tensor]:
+                return torch.cat([x, x * x], 1) - target, torch.stack([torch.ones_like(x), 2 * x], 1)
+
+            equations = normal_equations(linearize)
+            with torch.no_grad():
+                solution = minimize(equations, torch.full((2, 1), 0.5, dtype=F64), LONG)
+            return implicit_value(equations, solution)
+
+        target = torch.tensor([[0.4, -0.7], [2.0, 0.1]], dtype=F64, requires_grad=True)
+        # The minimum solves 2 x^3 + (1 - 2 b) x - a = 0: dx/da = 1 / (6 x^2 + 1 - 2 b), dx/db = 2 x times it.
+        x = nearest(target)
+        (got,) = torch.autograd.grad(x.sum(), target)
+        slope = 1 / (6 * x**2 + 1 - 2 * target[:, 1:])
+        assert_close(got, torch.cat([slope, 2 * x * slope], 1).detach(), atol=1e-6, rtol=0)
+        assert torch.equal(x, nearest(target.detach()))  # the value itself is the solution's, to the bit
+
+    def test_where_there_is_no_minimum_the_derivative_is_zero(self) -> None:
+        """An unknown that nothing depends on, and the top of a hill: neither has a positive definite Hessian."""
+        shift = torch.zeros(2, 2, dtype=F64, requires_grad=True)
+
+        def equations(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            y = x - shift
+            curve = torch.tensor([[1.0, 0.0], [1.0, -1.0]], dtype=F64)
+            return 0.5 * (curve * y * y).sum(1), curve * y, torch.diag_embed(curve)
+
+        zero = torch.zeros(2, dtype=F64)
+        stopped = Solution(
+            torch.zeros(2, 2, dtype=F64), zero, torch.zeros(2, 2, 2, dtype=F64), zero.long(), zero.long()
+        )
+        (got,) = torch.autograd.grad(implicit_value(equations, stopped).sum(), shift)
+        assert (got == 0).all()
+
+    def test_a_second_derivative_is_refused(self) -> None:
+        b = torch.ones(1, 2, dtype=F64, requires_grad=True)
+        equations = normal_equations(lambda x: (x - b, torch.eye(2, dtype=F64)[None]))
+        with torch.no_grad():
+            solution = minimize(equations, torch.zeros(1, 2, dtype=F64))
+        with pytest.raises(RuntimeError, match="differentiated once: leave out create_graph"):
+            torch.autograd.grad(implicit_value(equations, solution).sum(), b, create_graph=True)

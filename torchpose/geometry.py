@@ -4,6 +4,8 @@ Rotation vectors are in radians; every function takes any number of leading batc
 float dtype.
 """
 
+from math import factorial
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,38 +18,46 @@ def hat(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
-def _sinc_terms(theta2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+# sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 as series in -t^2: 1 / (2k + 1)!, 1 / (2k + 2)! and 1 / (2k + 3)!.
+SERIES = torch.tensor([[1 / factorial(2 * k + n) for n in (1, 2, 3)] for k in range(4)], dtype=torch.float64)
+# v @ GENERATORS are the nine entries of hat(v): one product in the place of nine small operations.
+GENERATORS = hat(torch.eye(3)).flatten(1)
+
+
+def _sinc_terms(theta2: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
     """sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 of t^2, smooth through zero."""
     # Below 1e-2 the differences cancel; the series' first dropped term is then below 1e-16.
     small = theta2 < 1e-4
     # Both branches of `where` are differentiated, so the unused one must stay finite: hence 1.
-    safe2 = torch.where(small, 1.0, theta2)
-    safe = safe2.sqrt()
-    a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), safe.sin() / safe)
-    half = (safe / 2).sin()
-    b = torch.where(small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), 2 * half * half / safe2)
-    c = torch.where(
-        small,
-        1 / 6 - theta2 / 120 * (1 - theta2 / 42 * (1 - theta2 / 72)),
-        (safe - safe.sin()) / (safe2 * safe),
-    )
-    return a, b, c
+    square = torch.where(small, 1.0, theta2)
+    theta = square.sqrt()
+    sine, half = theta.sin(), (0.5 * theta).sin()
+    far = torch.stack([sine / theta, 2 * half * half / square, (theta - sine) / (square * theta)], -1)
+    first, second, third, near = SERIES.to(theta2).unbind()
+    for coefficients in (third, second, first):
+        near = torch.addcmul(coefficients, theta2[..., None], near, value=-1)
+    return torch.where(small[..., None], near, far)
+
+
+def rotation_and_left_jacobian(
+    vector: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]]:
+    """`exp_rotation` and `left_jacobian` of the same vectors, for the price of one."""
+    a, b, c = _sinc_terms((vector * vector).sum(-1))[..., None, None].unbind(-3)
+    skew = (vector @ GENERATORS.to(vector)).unflatten(-1, (3, 3))
+    square = skew @ skew
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return torch.addcmul(eye + a * skew, b, square), torch.addcmul(eye + b * skew, c, square)
 
 
 def exp_rotation(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a rotation vector (Rodrigues' formula), differentiable everywhere."""
-    a, b, _ = _sinc_terms((vector * vector).sum(-1))
-    skew = hat(vector)
-    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return eye + a[..., None, None] * skew + b[..., None, None] * (skew @ skew)
+    return rotation_and_left_jacobian(vector)[0]
 
 
 def left_jacobian(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The matrix J with `d exp(v) = hat(J dv) exp(v)`: column k is the axis about which v_k turns."""
-    _, b, c = _sinc_terms((vector * vector).sum(-1))
-    skew = hat(vector)
-    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return eye + b[..., None, None] * skew + c[..., None, None] * (skew @ skew)
+    return rotation_and_left_jacobian(vector)[1]
 
 
 def rotation_between(

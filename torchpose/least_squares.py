@@ -16,6 +16,15 @@ Linearize = Callable[
     [Float[Tensor, "batch unknowns"]],
     tuple[Float[Tensor, "batch residuals"], Float[Tensor, "batch residuals unknowns"]],
 ]
+# Half the sum of squares, its gradient J^T r and J^T J: all that the minimiser needs of the residuals.
+NormalEquations = Callable[
+    [Float[Tensor, "batch unknowns"]],
+    tuple[
+        Float[Tensor, " batch"],
+        Float[Tensor, "batch unknowns"],
+        Float[Tensor, "batch unknowns unknowns"],
+    ],
+]
 
 
 class Status(IntEnum):
@@ -54,46 +63,52 @@ class Solution:
 def levenberg_marquardt(
     linearize: Linearize, start: Float[Tensor, "batch unknowns"], config: LMConfig = LMConfig()
 ) -> Solution:
-    """Minimise |r(x)|^2 / 2 for each row of `start` on its own.
+    """Minimise |r(x)|^2 / 2 for each row of `start` on its own: `minimize` for residuals with a Jacobian.
+
+    Args:
+        linearize: maps x (B, P) to residuals r (B, M) and their Jacobian (B, M, P).
+        start: first guess, a problem a row.
+    """
+    return minimize(normal_equations(linearize), start, config)
+
+
+def minimize(
+    equations: NormalEquations, start: Float[Tensor, "batch unknowns"], config: LMConfig = LMConfig()
+) -> Solution:
+    """Minimise a sum of squares for each row of `start` on its own, by Levenberg and Marquardt's method.
 
     Each step solves (J^T J + lambda diag(J^T J)) d = -J^T r. A step that lowers the loss is kept and lambda
     falls tenfold; otherwise x stays and lambda rises tenfold. So the loss never rises, and a row that is not
     finite, or has converged, changes neither itself nor its neighbours.
 
     Args:
-        linearize: maps x (B, P) to residuals r (B, M) and their Jacobian (B, M, P).
+        equations: maps x (B, P) to the loss |r|^2 / 2 (B,), J^T r (B, P) and J^T J (B, P, P).
         start: first guess, a problem a row.
     """
     x = start
-    residual, jacobian = linearize(x)
-    loss = _loss(residual)
-    broken = ~(loss.isfinite() & jacobian.flatten(1).isfinite().all(1))
-    active = ~broken
-    status = torch.where(broken, int(Status.NON_FINITE), int(Status.MAX_STEPS))
+    loss, gradient, normal = equations(x)
+    # A column of J that is not finite shows on the diagonal of J^T J.
+    finite = loss.isfinite() & gradient.isfinite().all(1) & _diagonal(normal).isfinite().all(1)
+    active = finite
+    status = torch.where(finite, int(Status.MAX_STEPS), int(Status.NON_FINITE))
     steps = torch.zeros_like(status)
     damping = torch.full_like(loss, config.damping)
-    normal, gradient = _normal_equations(residual, jacobian)
-    normal = torch.where(broken[:, None, None], 0.0, normal)
+    normal = torch.where(finite[:, None, None], normal, 0.0)
     for _ in range(config.max_steps):
         step, solved = _solve(normal, gradient, damping)
         trial = torch.where(active[:, None], x + step, x)
-        residual, jacobian = linearize(trial)
-        trial_loss = _loss(residual)
-        new_normal, new_gradient = _normal_equations(residual, jacobian)
+        trial_loss, trial_gradient, trial_normal = equations(trial)
         # False where the trial is not finite. A Jacobian that is not would leave no way on: its diagonal
         # tells.
-        linear = new_normal.diagonal(dim1=1, dim2=2).isfinite().all(1)
-        better = active & (trial_loss < loss) & linear
-        fall = loss - trial_loss
-        done = better & (
-            (step.abs().amax(1) < config.step_tolerance) | (fall <= config.loss_tolerance * loss)
-        )
+        better = active & (trial_loss < loss) & _diagonal(trial_normal).isfinite().all(1)
+        small = step.abs().amax(1) < config.step_tolerance
+        slow = loss - trial_loss <= config.loss_tolerance * loss
         # A rejected step this small means that the loss cannot be resolved any further.
-        done |= active & solved & ~better & (step.abs().amax(1) < config.step_tolerance)
+        done = active & torch.where(better, small | slow, solved & small)
         x = torch.where(better[:, None], trial, x)
         loss = torch.where(better, trial_loss, loss)
-        normal = torch.where(better[:, None, None], new_normal, normal)
-        gradient = torch.where(better[:, None], new_gradient, gradient)
+        normal = torch.where(better[:, None, None], trial_normal, normal)
+        gradient = torch.where(better[:, None], trial_gradient, gradient)
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
         steps = steps + active
         status = torch.where(done, int(Status.CONVERGED), status)
@@ -101,6 +116,48 @@ def levenberg_marquardt(
         if not bool(active.any()):
             break
     return Solution(x, loss, normal, status, steps)
+
+
+def normal_equations(linearize: Linearize) -> NormalEquations:
+    """The normal equations of residuals that come with their Jacobian."""
+
+    def equations(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        residual, jacobian = linearize(x)
+        gradient = (jacobian.mT @ residual[..., None])[..., 0]
+        return 0.5 * (residual * residual).sum(1), gradient, jacobian.mT @ jacobian
+
+    return equations
+
+
+def implicit_value(equations: NormalEquations, solution: Solution) -> Float[Tensor, "batch unknowns"]:
+    """`solution.value`, differentiable in whatever the closed form `equations` was built from.
+
+    At a minimum the gradient g(x, theta) is 0, so dx / d theta = -H^-1 dg / d theta with H = dg / dx, the loss's
+    exact Hessian (the implicit function theorem): the steps that led there are neither kept nor differentiated, and
+    H is made and factored in the backward pass only. Of a row that stopped short of the minimum this is the derivative
+    of a Newton step from there; one whose H is not positive definite gets 0.
+
+    `equations` must be finite in all rows. Differentiable once: a second derivative raises RuntimeError.
+    """
+    x = solution.value.detach().requires_grad_()
+    _, gradient, _ = equations(x)
+
+    def solve(cotangent: Tensor | None) -> Tensor | None:
+        if cotangent is None:
+            return None
+        if torch.is_grad_enabled():
+            raise RuntimeError("the value of a fit can be differentiated once: leave out create_graph=True")
+        P = x.shape[1]
+        unit = torch.eye(P, dtype=x.dtype, device=x.device)[:, None].expand(P, *x.shape)
+        (hessian,) = torch.autograd.grad(gradient, x, unit, retain_graph=True, is_grads_batched=True)
+        factor, failed = torch.linalg.cholesky_ex(hessian.transpose(0, 1))
+        minimum = (failed == 0)[:, None]
+        factor = torch.where(minimum[..., None], factor, unit.transpose(0, 1))
+        return torch.where(minimum, -torch.cholesky_solve(cotangent[..., None], factor)[..., 0], 0.0)
+
+    gap = gradient - gradient.detach()  # 0: only its derivative counts
+    gap.register_hook(solve)
+    return x.detach() + gap
 
 
 def linearize_by_autograd(residual: Residual) -> Linearize:
@@ -123,17 +180,13 @@ def linearize_by_autograd(residual: Residual) -> Linearize:
     return linearize
 
 
-def _loss(residual: Tensor) -> Tensor:
-    return 0.5 * (residual * residual).sum(1)
-
-
-def _normal_equations(residual: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
-    return jacobian.mT @ jacobian, (jacobian.mT @ residual[..., None])[..., 0]
+def _diagonal(matrix: Tensor) -> Tensor:
+    return matrix.diagonal(dim1=1, dim2=2)
 
 
 def _solve(normal: Tensor, gradient: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     """The damped Gauss-Newton step, and where there is one: elsewhere it is zero, so that lambda rises."""
-    diagonal = normal.diagonal(dim1=1, dim2=2)
+    diagonal = _diagonal(normal)
     # An unknown that nothing depends on has a zero diagonal; the floor keeps its step at zero, not at NaN.
     floor = diagonal.amax(1, keepdim=True) * torch.finfo(normal.dtype).eps + torch.finfo(normal.dtype).tiny
     factor, failed = torch.linalg.cholesky_ex(normal + torch.diag_embed(damping[:, None] * diagonal + floor))

@@ -1,7 +1,8 @@
 """Distances of points to spheroids: nearest point (App. D), nearest visible point, algebraic distance (3.3).
 
 A spheroid is given by its centre, its frame (columns: axes, the long one last) and its radii (a, c), a <= c,
-in the camera's frame, metres. Every function returns all B x K x N pairs: parts before points.
+in the camera's frame, metres. Every function returns all B x K x N pairs: parts before points. In memory the three
+coordinates stand before the points, so that sums over them and products with matrices run along the points.
 """
 
 from dataclasses import dataclass
@@ -29,19 +30,19 @@ class FootPoint:
     @property
     def distance(self) -> Float[Tensor, "batch parts num"]:
         """Euclidean distance, m."""
-        return self.residual.norm(dim=-1)
+        return _length(self.residual)[..., 0]
 
 
 def to_local(posed: PosedBody, points: Float[Tensor, "batch num 3"]) -> Float[Tensor, "batch parts num 3"]:
     """Points of the camera's frame in the frame of every spheroid, m."""
-    return (points[:, None] - posed.centers[:, :, None]) @ posed.frames
+    return (posed.frames.mT @ (points.mT[:, None] - posed.centers[..., None])).mT
 
 
 def to_camera(
     posed: PosedBody, local: Float[Tensor, "batch parts num 3"]
 ) -> Float[Tensor, "batch parts num 3"]:
     """Points of the spheroids' frames in the camera's frame, m."""
-    return local @ posed.frames.mT + posed.centers[:, :, None]
+    return (posed.frames @ local.mT + posed.centers[..., None]).mT
 
 
 def nearest_point(
@@ -49,48 +50,63 @@ def nearest_point(
 ) -> Float[Tensor, "batch parts num 3"]:
     """The nearest point of the surface of each spheroid to each point, both in the spheroid's frame, m.
 
-    In the half plane of the point and the long axis it is the nearest point (u, v) of the ellipse to (r0, z)
-    (T. Fig. 3.5). With s = 1 + t/a^2, u = r0 / s and v = z / (1 + (a/c)^2 (s - 1)); s solves N(s) = (u/a)^2 +
-    (v/c)^2 = 1. Newton runs on 1/sqrt(N) - 1, concave and rising (a power mean of lines), from a lower bound
-    of the root. On the long axis the direction across is arbitrary, and at the centre any equator point is
-    nearest: the first axis. Gradients are exact: the last step is differentiable. There is none across the
-    long axis, where it is not defined.
+    It lies in the half plane of the point and the long axis. On the long axis the direction across is arbitrary, and
+    at the centre any equator point is nearest: the first axis. Gradients are exact. There is none across the long axis,
+    where it is not defined.
     """
     a, c = radii[..., None, 0], radii[..., None, 1]
     x, y, z = local.unbind(-1)
-    # Keeps the root off s = 0. A point on the axis moves by 6e-6 of the radius (float32), its distance to the
-    # foot, which is stationary, by the square of that.
-    tiny = torch.finfo(local.dtype).eps ** 0.75 * a
     square = x * x + y * y
-    on_axis = square <= tiny * tiny
+    on_axis = square <= (_shortest(a)) ** 2
     across = torch.where(on_axis, 1.0, square).sqrt()  # 1: the unused branch is differentiated too
-    r0 = torch.where(on_axis, tiny, across)
+    u, v = _on_ellipse(torch.where(on_axis, _shortest(a), across), z, a, c)
+    ux, uy = torch.where(on_axis, 1.0, x / across), torch.where(on_axis, 0.0, y / across)
+    return torch.stack([u * ux, u * uy, v], -2).mT
+
+
+def _shortest(a: Tensor) -> Tensor:
+    """Keeps the solver off its pole. A point on the axis moves by 6e-6 of the radius (float32), its distance to the
+    foot, which is stationary, by the square of that."""
+    return torch.finfo(a.dtype).eps ** 0.75 * a
+
+
+def _on_ellipse(
+    r: Float[Tensor, "batch parts num"],
+    z: Float[Tensor, "batch parts num"],
+    a: Float[Tensor, "batch parts 1"],
+    c: Float[Tensor, "batch parts 1"],
+) -> tuple[Float[Tensor, "batch parts num"], Float[Tensor, "batch parts num"]]:
+    """The nearest point (u, v) of the ellipse (u/a)^2 + (v/c)^2 = 1 to (r, z), r > 0 (T. Fig. 3.5).
+
+    With s = 1 + t/a^2, u = r / s and v = z / (1 + (a/c)^2 (s - 1)); s solves N(s) = (u/a)^2 + (v/c)^2 = 1. Newton runs
+    on 1/sqrt(N) - 1, concave and rising (a power mean of lines), from a lower bound of the root. The last step is
+    differentiable, which makes gradients exact.
+    """
     flat = (a / c) ** 2
     slack = 1 - flat
+    p, q = r / a, z / c
 
     def newton(s: Tensor) -> Tensor:
-        u, stretch = r0 / (a * s), slack + flat * s
-        v = z / (c * stretch)
-        N = u * u + v * v
-        slope = u * u / s + flat * v * v / stretch  # -N'/2
-        return s + N * (N.sqrt() - 1) / slope
+        stretch = torch.addcmul(slack, flat, s)
+        uu, vv = (p / s) ** 2, (q / stretch) ** 2
+        N = uu + vv
+        slope = torch.addcdiv(uu / s, flat * vv, stretch)  # -N'/2
+        return torch.addcdiv(s, N * (N.sqrt() - 1), slope)
 
     with torch.no_grad():
-        p, q = r0 / a, z.abs() / c
         # Three lower bounds: each term of N alone; and near the long axis, where Newton creeps from those,
         # (p/s)^2 = 1 - (v/c)^2 <= 2 (short + flat s) / m, of which one summand is at least half of (p/s)^2.
-        m, short = torch.maximum(slack, q), (slack - q).clamp_min(torch.finfo(local.dtype).tiny)
+        height = q.abs()
+        m, short = torch.maximum(slack, height), (slack - height).clamp_min(torch.finfo(r.dtype).tiny)
         near = torch.minimum((m * p * p / (4 * flat)) ** (1 / 3), p * (m / (4 * short)).sqrt())
-        s = torch.maximum(torch.maximum(p, (q - slack) / flat), near)
+        s = torch.maximum(torch.maximum(p, (height - slack) / flat), near)
         for _ in range(NEWTON_STEPS):
             s = newton(s)
     s = newton(s)
-    u, v = r0 / s, z / (slack + flat * s)
-    # Rounding in s leaves the point off the surface by its relative error; one scaling puts it back on.
-    scale = torch.rsqrt((u / a) ** 2 + (v / c) ** 2)
-    ux = torch.where(on_axis, 1.0, x / across)
-    uy = torch.where(on_axis, 0.0, y / across)
-    return torch.stack([u * scale * ux, u * scale * uy, v * scale], -1)
+    u, v = p / s, q / torch.addcmul(slack, flat, s)
+    # Rounding in s leaves the point off the curve by its relative error; one scaling puts it back on.
+    scale = torch.rsqrt(u * u + v * v)
+    return u * scale * a, v * scale * c
 
 
 def surface_normal(
@@ -98,7 +114,8 @@ def surface_normal(
 ) -> Float[Tensor, "batch parts num 3"]:
     """Outward unit normal of the spheroid through each point, in its frame."""
     a, c = radii.unbind(-1)
-    return torch.nn.functional.normalize(local / torch.stack([a, a, c], -1)[:, :, None] ** 2, dim=-1)
+    gradient = local / torch.stack([a, a, c], -1)[:, :, None] ** 2
+    return gradient / _length(gradient)
 
 
 def foot_point(posed: PosedBody, points: Float[Tensor, "batch num 3"], visible: bool = True) -> FootPoint:
@@ -112,16 +129,23 @@ def foot_point(posed: PosedBody, points: Float[Tensor, "batch num 3"], visible: 
     nearest = nearest_point(local, posed.radii)
     camera = _camera(posed)
     beyond = (camera * camera).sum(-1, keepdim=True) > 1  # a camera inside a spheroid sees no rim
-    hidden = ((nearest / _extent(posed)[:, :, None] * camera[:, :, None]).sum(-1) < 1) & beyond
+    hidden = ((nearest @ (camera / _extent(posed))[..., None])[..., 0] < 1) & beyond
     if visible:
         rim = _rim(posed)
-        flat = (local - rim.center[:, :, None]) @ rim.axes
-        # The rim is an ellipse, a slice of the spheroid of its two half axes: one solver serves both.
-        flat = torch.stack([flat[..., 0], torch.zeros_like(flat[..., 0]), flat[..., 1]], -1)
-        flat = nearest_point(flat, rim.radii)[..., ::2]
-        onto = rim.center[:, :, None] + flat @ rim.axes.mT
-        nearest = torch.where(hidden[..., None], onto, nearest)
+        # The rim is an ellipse, a slice of the spheroid of its two half axes.
+        x, z = (rim.axes.mT @ (local - rim.center[:, :, None]).mT).unbind(-2)
+        a, c = rim.radii[..., None].unbind(-2)
+        u, v = _on_ellipse(torch.maximum(x.abs(), _shortest(a)), z, a, c)
+        onto = rim.axes @ torch.stack([torch.copysign(u, x), v], -2) + rim.center[..., None]
+        nearest = torch.where(hidden[..., None], onto.mT, nearest)
     return FootPoint(nearest, surface_normal(nearest, posed.radii), local - nearest, hidden)
+
+
+def _length(vector: Float[Tensor, "batch parts num 3"]) -> Float[Tensor, "batch parts num 1"]:
+    """The Euclidean norm, 30 times faster than torch's where the coordinates are not neighbours in memory."""
+    # The root of 0 has no derivative; the floor gives it 0.
+    square = (vector * vector).sum(-1, keepdim=True)
+    return square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.body.skeleton import HUMAN, Hinges, SizedVector, load_skeleton
-from torchpose.geometry import axis_pair_angles, exp_rotation, left_jacobian, rotation_between
+from torchpose.geometry import axis_pair_angles, exp_rotation, rotation_and_left_jacobian, rotation_between
 
 
 class JointKind(Enum):
@@ -61,11 +61,15 @@ class BodyModel(nn.Module):
     limbs: Tensor  # (J, 3) direction of each limb in its own body
     centers: Tensor  # (J, 3) direction of each limb at zero, in the parent body
     align: Tensor  # (J, 3, 3) brings `limbs` to `centers`: the body's rotation at zero
-    offset_basis: Tensor  # (J, 3, S) and so on: times the sizes, vectors in the body's frame
-    center_basis: Tensor
-    joint_basis: Tensor
-    radius_basis: Tensor
+    # (S, 3 J + 3 K + 3 joints + 2 K): sizes times it are offsets in the parents' frames, centres and joints in
+    # their bodies', and radii.
+    size_basis: Tensor
     segment_frames: Tensor  # (K, 3, 3) columns: the spheroid's axes in its body
+    bottom: Tensor  # (6,) the last row of a body's place in its parent
+    by_depth: Tensor  # (J,) the bodies but for the root, by their depth in the tree
+    above: Tensor  # (J,) where among root and `by_depth` the parent of each of these is
+    places: Tensor  # (bodies,) where among them each body is
+    carriers: Tensor  # (K + joints,) the body that carries each spheroid and joint
 
     def __init__(self, config: BodyConfig = BodyConfig()):
         super().__init__()
@@ -80,7 +84,7 @@ class BodyModel(nn.Module):
         self.num_lengths = skeleton.num_lengths
         self.segment_bodies = tuple(segment.body for segment in skeleton.segments)
         self.joint_bodies = tuple(joint.body for joint in skeleton.joints)
-        self.levels = self._group_by_depth()
+        self._register_order()
         self._register_tree()
         self._register_sizes()
 
@@ -92,14 +96,20 @@ class BodyModel(nn.Module):
     def num_parts(self) -> int:
         return len(self.segment_names)
 
-    def _group_by_depth(self) -> tuple[tuple[int, ...], ...]:
-        """Bodies of equal depth: one batched product each. Index 0 of `rotations` is the root."""
+    def _register_order(self) -> None:
+        """Bodies of equal depth are placed together, after those above them: one product a level."""
         depth = [0]
         for parent in self.parents:
             depth.append(depth[parent] + 1)
-        return tuple(
-            tuple(i for i, d in enumerate(depth) if d == level) for level in range(1, max(depth) + 1)
-        )
+        order = sorted(range(len(depth)), key=lambda i: depth[i])  # the root is body 0 and comes first
+        self.levels = tuple(depth.count(level) for level in range(1, max(depth) + 1))
+        for name, index in (
+            ("by_depth", [i - 1 for i in order[1:]]),
+            ("above", [order.index(self.parents[i - 1]) for i in order[1:]]),
+            ("places", [order.index(i) for i in range(len(depth))]),
+            ("carriers", [*self.segment_bodies, *self.joint_bodies]),
+        ):
+            self.register_buffer(name, torch.tensor(index), persistent=False)
 
     def _register_tree(self) -> None:
         chain = self.skeleton.chain()
@@ -156,14 +166,19 @@ class BodyModel(nn.Module):
             return table
 
         skeleton = self.skeleton
-        self._constant("offset_basis", basis([body.origin for body in skeleton.bodies]))
-        self._constant("center_basis", basis([segment.center for segment in skeleton.segments]))
-        self._constant("joint_basis", basis([joint.at for joint in skeleton.joints]))
         radii = torch.zeros(len(skeleton.segments), 2, len(self.size_names))
         for row, segment in enumerate(skeleton.segments):
             for column, (name, value) in enumerate((segment.radius, segment.half_length)):
                 radii[row, column, self.size_names.index(name)] = value
-        self._constant("radius_basis", radii)
+        tables = [
+            basis([body.origin for body in skeleton.bodies]),
+            basis([segment.center for segment in skeleton.segments]),
+            basis([joint.at for joint in skeleton.joints]),
+            radii,
+        ]
+        self.size_counts = [len(table.flatten(0, 1)) for table in tables]
+        self._constant("bottom", torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
+        self._constant("size_basis", torch.cat([table.flatten(0, 1) for table in tables]).mT)
         long_axis = torch.tensor([segment.axis for segment in skeleton.segments])
         up = torch.tensor([0.0, 0.0, 1.0]).expand_as(long_axis)
         self._constant("segment_frames", exp_rotation(rotation_between(up.double(), long_axis.double())))
@@ -187,75 +202,62 @@ class BodyModel(nn.Module):
         B = pose.shape[0]
         if size is None:
             size = self.default_size(1)
-        rotation, shift, axis, origin = self._joints(pose, size)
-        rotations: list[Tensor] = [rotation[:, 0]] + [pose] * len(self.parents)
-        origins: list[Tensor] = [pose[:, :3]] + [pose] * len(self.parents)
-        screw_axes: list[Tensor] = [axis[:, :6]] + [pose] * len(self.parents)
-        for level in self.levels:
-            above = [self.parents[i - 1] for i in level]
-            parent = torch.stack([rotations[i] for i in above], 1)  # (B, level, 3, 3)
-            turned = parent @ rotation[:, level]
-            moved = torch.stack([origins[i] for i in above], 1) + (parent @ shift[:, level, :, None])[..., 0]
-            across = (
-                parent[:, :, None] @ axis[:, 6:].unflatten(1, (-1, 2))[:, [i - 1 for i in level]][..., None]
-            )
-            for slot, i in enumerate(level):
-                rotations[i], origins[i], screw_axes[i] = (
-                    turned[:, slot],
-                    moved[:, slot],
-                    across[:, slot, :, :, 0],
-                )
-        R, t = torch.stack(rotations, 1), torch.stack(origins, 1)
-        centers = t[:, self.segment_bodies] + _turned(
-            R[:, self.segment_bodies], self.center_basis @ size[:, None, :, None]
+        shift, center, joint, radii = (
+            x.unflatten(1, (-1, n)).expand(B, -1, -1)
+            for x, n in zip((size @ self.size_basis).split(self.size_counts, 1), (3, 3, 3, 2), strict=True)
         )
-        joints = t[:, self.joint_bodies] + _turned(
-            R[:, self.joint_bodies], self.joint_basis @ size[:, None, :, None]
-        )
-        radii = (self.radius_basis @ size[:, None, :, None])[..., 0].expand(B, -1, -1)
+        root, root_axes, local, axes = self._turns(pose)
+        # Each body as (R, t, axes of its joint), 3 x 6: the parent's (R, t) times (local; 0 0 0 1 0 0) places it.
+        bottom = self.bottom.expand(B, len(self.parents), 1, 6)
+        step = torch.cat([torch.cat([local, shift[..., None], axes.mT], -1), bottom], -2)
+        step = step.index_select(1, self.by_depth)
+        placed = torch.cat([root, pose[:, :3, None], torch.zeros_like(root[..., :2])], -1)[:, None]
+        first = 0
+        for count in self.levels:
+            above = placed.index_select(1, self.above[first : first + count])[..., :4]
+            placed = torch.cat([placed, above @ step[:, first : first + count]], 1)
+            first += count
+        placed = placed.index_select(1, self.places)
+        R, t = placed[..., :3], placed[..., 3]
+        carriers = placed.index_select(1, self.carriers)
+        turns = carriers[..., :3]
+        points = (turns @ torch.cat([center, joint], 1)[..., None])[..., 0] + carriers[..., 3]
+        centers, joints = points.split([self.num_parts, len(self.joint_bodies)], 1)
         # A stout person's segment may grow as thick as it is long, but a spheroid's long axis stays the long one.
-        radii = torch.stack([radii[..., 0], torch.maximum(radii[..., 0], radii[..., 1])], -1)
+        across, along = radii.unbind(-1)
         return PosedBody(
             R,
             t,
             centers,
-            R[:, self.segment_bodies] @ self.segment_frames,
-            radii,
+            turns[:, : self.num_parts] @ self.segment_frames,
+            torch.stack([across, torch.maximum(across, along)], -1),
             joints,
-            torch.cat(screw_axes, 1),
-            torch.cat([origin[:, :6], t[:, 1:].repeat_interleave(2, 1)], 1),
+            torch.cat([root_axes, placed[:, 1:, :, 4:].mT.flatten(1, 2)], 1),
+            torch.cat([pose[:, None, :3].expand(B, 6, 3), t[:, 1:].repeat_interleave(2, 1)], 1),
         )
 
-    def _joints(
-        self, pose: Float[Tensor, "batch parameters"], size: Float[Tensor, "#batch sizes"]
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Bodies' rotations and shifts and parameters' axes in the parents' frames; the root's origins."""
-        B = pose.shape[0]
-        yaw, pitch, roll = exp_rotation(self.axes[3:6] * pose[:, 3:6, None]).unbind(1)
-        turned = yaw @ pitch
-        eye = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(B, 3, 3)
-        root_axes = torch.cat([eye, yaw[:, :, 1:2].mT, yaw[:, :, 0:1].mT, turned[:, :, 2:3].mT], 1)
+    def _turns(self, pose: Float[Tensor, "batch parameters"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The root's rotation and the axes of its parameters; of the joints the same, in the parents' frames."""
+        root = self.axes[3:6] * pose[:, 3:6, None]
         angles = pose[:, 6:].unflatten(1, (-1, 2))  # (B, J, 2)
         axes = self.axes[6:].unflatten(0, (-1, 2))  # (J, 2, 3)
+        turned = angles[..., None] * axes
         if self.config.joint is JointKind.swing:
-            vector = (angles[..., None] * axes).sum(2)
-            local = exp_rotation(vector) @ self.align
-            across = (left_jacobian(vector) @ axes.mT).mT  # (B, J, 2, 3)
+            rotation, slope = rotation_and_left_jacobian(torch.cat([root, turned.sum(2)], 1))
+            local = rotation[:, 3:] @ self.align
+            across = (slope[:, 3:] @ axes.mT).mT  # (B, J, 2, 3)
         else:
-            first, second = exp_rotation(angles[..., None] * axes).unbind(2)
+            rotation = exp_rotation(torch.cat([root, turned.flatten(1, 2)], 1))
+            first, second = rotation[:, 3:].unflatten(1, (-1, 2)).unbind(2)
             local = first @ second
             across = torch.stack(
                 [axes[:, 0].expand_as(first[..., 0]), (first @ axes[:, 1, :, None])[..., 0]], 2
             )
-        shift = (self.offset_basis @ size[:, None, :, None])[..., 0].expand(B, -1, -1)
-        rotation = torch.cat([(turned @ roll)[:, None], local], 1)
-        origin = pose[:, None, :3].expand(B, 6, 3)
-        return (
-            rotation,
-            torch.cat([origin[:, :1], shift], 1),
-            torch.cat([root_axes, across.flatten(1, 2)], 1),
-            origin,
-        )
+        yaw, pitch, roll = rotation[:, :3].unbind(1)
+        turned = yaw @ pitch
+        eye = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(len(pose), 3, 3)
+        root_axes = torch.cat([eye, yaw.mT[:, 1:2], yaw.mT[:, :1], turned.mT[:, 2:]], 1)
+        return turned @ roll, root_axes, local, across
 
     def jacobian(
         self, posed: PosedBody, points: Float[Tensor, "batch parts num 3"]
@@ -271,7 +273,7 @@ class BodyModel(nn.Module):
     @property
     def part_moves(self) -> Bool[Tensor, "parts parameters"]:
         """Which parameters move which spheroid."""
-        return self.moves[list(self.segment_bodies)]
+        return self.moves.index_select(0, self.carriers[: self.num_parts])
 
     def pose_from_directions(
         self,

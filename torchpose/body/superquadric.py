@@ -220,6 +220,7 @@ class Person:
     height: float = 1.75  # m, standing, in shoes
     girth: float = 1.0  # all girths, 1 = the body file's
     lengths: tuple[float, ...] = ()  # proportions: a factor for each of the body file's lengths; empty: all 1
+    girths: tuple[float, ...] = ()  # the same for its girths, beside `girth`
     colours: tuple[Vector, ...] = (
         (0.78, 0.58, 0.47),
         (0.16, 0.11, 0.08),
@@ -249,17 +250,19 @@ class Person:
 
     def size(self, body: BodyModel) -> Float[Tensor, "1 sizes"]:
         """The person's sizes for `body`: proportions scaled to the standing height, and girths."""
-        lengths = self.lengths or (1.0,) * body.num_lengths
-        if len(lengths) != body.num_lengths:
-            raise ValueError(
-                f"the person has {len(lengths)} lengths and the body {body.num_lengths}: use the body's own"
-            )
         size = body.default_size(1).clone()
-        size[0, : body.num_lengths] = size.new_tensor(lengths)
+        lengths, girths = size[0, : body.num_lengths], size[0, body.num_lengths :]
+        for name, own, all_of in (("lengths", self.lengths, lengths), ("girths", self.girths, girths)):
+            if own and len(own) != len(all_of):
+                raise ValueError(
+                    f"the person has {len(own)} {name} and the body {len(all_of)}: use the body's own"
+                )
+            if own:
+                all_of.copy_(all_of.new_tensor(own))
         shares = yaml.safe_load(PERSON.read_text())["stature"]
         stature = sum(share * size[0, body.size_names.index(name)].item() for name, share in shares.items())
-        size[0, : body.num_lengths] *= self.height / stature
-        size[0, body.num_lengths :] *= self.girth * self.height / sum(shares.values())
+        lengths *= self.height / stature
+        girths *= self.girth * self.height / sum(shares.values())
         return size
 
 

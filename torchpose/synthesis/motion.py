@@ -1,5 +1,5 @@
-"""How people move: the eight activities of the thesis (T. 5.3), free motion and a demonstration, as poses
-over time.
+"""How people move: the eight activities of the thesis (T. 5.3), its exercises of single joints (T. 5.1, 5.2),
+free motion and a demonstration, as poses over time.
 
 Left-camera frame (x right, y down, z forward); metres, radians, seconds. Left and right are the subject's.
 Every take is drawn from random streams named after the person and the take, so it does not depend on what was
@@ -30,7 +30,9 @@ ACTIVITIES = (
     "walking",
     "sitting",
 )
-MOTIONS = (*ACTIVITIES, "free", "demo")
+# What the thesis measured angles on (5.1 and Table 5.1), and a trunk that turns to and fro.
+EXERCISES = ("arms", "elbow_horizontal", "elbow_vertical", "knee", "shoulder", "turning")
+MOTIONS = (*ACTIVITIES, *EXERCISES, "free", "demo")
 LEFT, RIGHT = 0, 1
 AHEAD = math.pi / 2  # azimuth of a limb that is raised straight ahead; 0: outward to its own side
 
@@ -214,15 +216,95 @@ def _sit(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
     return figure
 
 
-def _move_freely(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-    figure = _standing(take, times)
-    pace = 1 / period
+def _exercise_arms(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    """Elbows and shoulders move and nothing else does (T. 5.1)."""
+    still, T = _standing(take, times[:1]), len(times)
+    figure = _Figure(
+        arms=still.arms.repeat(1, 1, T),
+        legs=still.legs.repeat(1, 1, T),
+        trunk=still.trunk.repeat(1, T),
+        head=still.head.repeat(1, T),
+    )
+    _wander_arms(figure, take, times, 1.8 / period)
+    return figure
+
+
+def _wander_arms(figure: _Figure, take: _Draw, times: Tensor, pace: float) -> None:
+    """Shoulders and elbows wander through their range, up to `pace` Hz."""
     for side in (LEFT, RIGHT):
         rise = 1.0 + take.drift(times, 0.95, pace)
         figure.arms[side, 0] = rise
         figure.arms[side, 1] = take(0.5, 1.1) + take.drift(times, 0.5, pace)
         figure.arms[side, 2] = rise + 0.8 + take.drift(times, 0.75, pace)
         figure.arms[side, 3] = figure.arms[side, 1] + take.drift(times, 0.5, pace)
+
+
+def _bend_elbows(up: bool) -> _Act:
+    """The upper arms are held out; the forearms go from straight to a right angle, forward or up."""
+
+    def act(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+        figure = _standing(take, times)
+        rise, azimuth, bend = style(1.4, 1.6), style(0.05, 0.3), style(1.35, 1.65)
+        phase = _repetition(take, times, period)
+        for side in (LEFT, RIGHT):
+            flexion = style(0.05, 0.2) + bend * _up_and_down(phase + take(-0.15, 0.15)) * take(0.92, 1.0)
+            figure.arms[side, 0] = rise + take.drift(times, 0.06)
+            figure.arms[side, 1] = azimuth + take.drift(times, 0.06)
+            figure.arms[side, 2] = figure.arms[side, 0] + (flexion if up else take.drift(times, 0.06))
+            figure.arms[side, 3] = figure.arms[side, 1] + (take.drift(times, 0.06) if up else flexion)
+        return figure
+
+    return act
+
+
+def _bend_knees(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    """A knee is lifted until thigh and shank make a right angle, the right one and the left in turn."""
+    figure = _standing(take, times)
+    phase = _repetition(take, times, period)
+    top, azimuth = style(1.2, 1.5), style(1.3, 1.5)
+    for side in (LEFT, RIGHT):
+        own = (phase / math.tau).floor().remainder(2) != side
+        lift = own * _up_and_down(phase) * take(0.92, 1.0)
+        figure.legs[side, 0] += top * lift
+        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * _soon(lift)
+        figure.legs[side, 2] -= (math.pi / 2 - top) * lift
+        figure.legs[side, 3] = azimuth
+    figure.arms[:, 0] += style(0.0, 0.2)
+    return figure
+
+
+def _circle_arms(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    """Straight arms go up at the sides, down to the front, out to the sides and down again (T. Fig. 5.6)."""
+    figure = _standing(take, times)
+    phase = _repetition(take, times, 2.4 * period)
+    top, level, front = style(2.5, 2.75), style(1.45, 1.6), style(1.3, 1.45)
+    for side in (LEFT, RIGHT):
+        own = (phase + take(-0.1, 0.1)).remainder(math.tau) * (4 / math.tau)  # quarters of the round
+        up, over, out, down = (_smooth(own - quarter) for quarter in range(4))
+        hanging = figure.arms[side, 0].clone()
+        figure.arms[side, 0] += (top - hanging) * up + (level - top) * over - (level - hanging) * down
+        figure.arms[side, 1] = take(0.1, 0.3) + (front - 0.2) * (over - out)
+        figure.arms[side, 2:] = figure.arms[side, :2]
+        figure.arms[side, 2] += style(0.05, 0.15) + take.drift(times, 0.04)
+    return figure
+
+
+def _turn(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    """The trunk turns to the right and to the left, 40 degrees each."""
+    figure = _standing(take, times)
+    phase = _repetition(take, times, 1.5 * period)
+    figure.trunk[0] += 0.7 * phase.sin() * take(0.95, 1.0)
+    swing, bend = style(0.1, 0.3), style(0.1, 0.9)
+    for side, way in ((LEFT, 1.0), (RIGHT, -1.0)):
+        figure.arms[side, 0] += swing * (1 + way * (phase - 0.3).sin())
+        figure.arms[side, 2] += swing * (1 + way * (phase - 0.5).sin()) + bend
+    return figure
+
+
+def _move_freely(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+    figure = _standing(take, times)
+    pace = 1 / period
+    _wander_arms(figure, take, times, pace)
     # One foot stands while the other is lifted a little.
     balance = take.drift(times, 1.0, pace)
     for side in (LEFT, RIGHT):
@@ -283,6 +365,12 @@ _ACTS: dict[str, _Act] = {
     "right_leg": _raise_leg(RIGHT),
     "walking": _walk,
     "sitting": _sit,
+    "arms": _exercise_arms,
+    "elbow_horizontal": _bend_elbows(up=False),
+    "elbow_vertical": _bend_elbows(up=True),
+    "knee": _bend_knees,
+    "shoulder": _circle_arms,
+    "turning": _turn,
     "free": _move_freely,
     "demo": _demonstrate,
 }
@@ -310,7 +398,8 @@ def perform(
     style, draw = _Draw("style", motion, person), _Draw("take", motion, person, take)
     place = _Draw("place", person, take, motion)
     figure = _ACTS[motion](style, draw, times, place(*config.period))
-    heading = 0.25 * place(-1.0, 1.0) if motion == "demo" else config.heading * place(-1.0, 1.0)
+    facing = 0.25 if motion in ("demo", "turning") else config.heading
+    heading = facing * place(-1.0, 1.0)
     turn, lean, tilt = figure.trunk
     nod, aslant = figure.head
     leaning = exp_rotation(_along(1, turn)) @ exp_rotation(_along(0, lean)) @ exp_rotation(_along(2, tilt))

@@ -93,6 +93,18 @@ class PosedShapes:
         behind = (z <= 0).any(1, keepdim=True)
         return torch.cat((low.masked_fill(behind, -math.inf), high.masked_fill(behind, math.inf)), -1)
 
+    def window(self, camera: StereoCamera) -> tuple[slice, slice]:
+        """Rows and columns of the image that hold all parts, with a pixel's margin."""
+        bounds = self.bounds()
+        low = bounds[:, :2].amin(0) * camera.focal_length
+        high = bounds[:, 2:].amax(0) * camera.focal_length
+
+        def cut(first: Tensor, last: Tensor, center: float, size: int) -> slice:
+            begin = int((first + center).floor().clamp(0, size)) - 1
+            return slice(max(begin, 0), int((last + center).ceil().clamp(-2, size - 1)) + 2)
+
+        return cut(low[1], high[1], camera.cy, camera.height), cut(low[0], high[0], camera.cx, camera.width)
+
     def seen_from(self, eye: Float[Tensor, "3"], turn: Float[Tensor, "3 3"] | None = None) -> "PosedShapes":
         """The same from another eye, whose axes are the columns of `turn` (None: the same axes)."""
         origins = self.origins - eye
@@ -256,7 +268,7 @@ class StereoRenderer(nn.Module):
         image = self.ambient[eye] + self.direct[eye] * (1 - shadow.on_room(self.slopes[eye]))
         depth = self.depths[eye].clone()
         labels = torch.zeros_like(depth, dtype=torch.long)
-        rows, columns = self._window(posed)
+        rows, columns = posed.window(self.camera)
         pixels, patch, beyond = self._pixels(rows, columns), image[:, rows, columns], depth[rows, columns]
         size = beyond.shape
         hits, seen = self._see(posed, shadow, eye, pixels, beyond.flatten(), patch.flatten(1).T)
@@ -278,18 +290,6 @@ class StereoRenderer(nn.Module):
         beyond.copy_(torch.where(part >= 0, hits.depth.reshape(size), beyond))
         labels[rows, columns] = torch.where(part >= 0, self.display.segments[part] + 1, 0)
         return image, depth, labels
-
-    def _window(self, posed: PosedShapes) -> tuple[slice, slice]:
-        """Rows and columns of the image that hold the whole person."""
-        bounds, camera = posed.bounds(), self.camera
-        low = bounds[:, :2].amin(0) * camera.focal_length
-        high = bounds[:, 2:].amax(0) * camera.focal_length
-
-        def cut(first: Tensor, last: Tensor, center: float, size: int) -> slice:
-            begin = int((first + center).floor().clamp(0, size)) - 1
-            return slice(max(begin, 0), int((last + center).ceil().clamp(-2, size - 1)) + 2)
-
-        return cut(low[1], high[1], camera.cy, camera.height), cut(low[0], high[0], camera.cx, camera.width)
 
     def _pixels(self, rows: slice, columns: slice) -> Float[Tensor, "num 2"]:
         """Centres (u, v) of the pixels of a window, row by row."""

@@ -1,0 +1,149 @@
+"""Sums over a part's rows against the rows themselves: by definition, by autograd, in single precision, in a batch."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_fitting import JOINTS, body_of, random_pose, random_size, rows_of
+from torch.testing import assert_close
+
+from torchpose.registration import moment
+from torchpose.registration.fitting import (
+    FittingConfig,
+    PosePrior,
+    Rows,
+    equations_by_moments,
+    linearize_by_screws,
+    pose_residual,
+)
+from torchpose.registration.moment import MomentEquations, sum_rows
+
+each_kind = pytest.mark.parametrize("kind", JOINTS, ids=lambda kind: kind.name)
+
+
+def residual_of(rows, posed):
+    return (rows.direction * (rows.target - rows.points(posed))).sum(-1)
+
+
+def sums_of(rows, posed):
+    return sum_rows(rows.part, rows.local, rows.direction, residual_of(rows, posed), posed)
+
+
+def scene(kind=JOINTS[0], batch=2, per_part=6, dtype=torch.float64):
+    """A body, a pose far from where its rows have it, and rows 5 mm off with a standard deviation of 2 cm."""
+    body = body_of(kind, dtype)
+    truth, size = random_pose(body, batch), random_size(body)
+    rows = rows_of(body, truth, size, per_part=per_part, noise=0.005)
+    return body, truth, size, replace(rows, direction=rows.direction / 0.02)
+
+
+def test_a_sum_is_that_of_every_rows_products():
+    """By definition, row by row and part by part; the parts' rows come mixed, and part 3 has none."""
+    body, truth, size, rows = scene()
+    order = torch.randperm(rows.part.shape[1])
+    rows = Rows(*(getattr(rows, name)[:, order] for name in Rows.__dataclass_fields__))
+    rows = replace(rows, part=torch.where(rows.part == 3, 5, rows.part))
+    posed = body(truth + 0.2, size)
+    moments = sums_of(rows, posed)
+    expected = torch.zeros(2, 14, 13, 13, dtype=torch.float64)
+    for b in range(2):
+        for i in range(rows.part.shape[1]):
+            k, n, h = rows.part[b, i], rows.direction[b, i], torch.cat([rows.local[b, i], torch.ones(1)])
+            gap = n @ (rows.target[b, i] - posed.frames[b, k] @ rows.local[b, i] - posed.centers[b, k])
+            a = torch.cat([torch.outer(n, h).flatten(), gap[None]])
+            expected[b, k] += torch.outer(a, a)
+    assert_close(moments.matrix, expected, atol=1e-9, rtol=1e-12)
+    assert (moments.matrix[:, 3] == 0).all()
+    assert_close(moments.frames[..., :3], posed.frames)
+    assert_close(moments.frames[..., 3] + moments.pivot, posed.centers)
+
+
+@each_kind
+def test_the_equations_are_those_of_the_rows_at_any_pose(kind):
+    """Summed at one pose and asked for at another, against the rows' own Jacobian and against autograd's."""
+    body, truth, size, rows = scene(kind)
+    pose = truth + 0.5 * torch.randn_like(truth)
+    whole = MomentEquations(sums_of(rows, body(truth - 0.3, size)), body.part_moves)(body(pose, size))
+    nothing, config = PosePrior(pose, torch.zeros_like(pose)), FittingConfig(limit_sd=0.0)
+    r, J = (x[:, : rows.part.shape[1]] for x in linearize_by_screws(body, size, rows, nothing, config)(pose))
+    both = torch.cat([J, r[..., None]], 2)
+    assert_close(whole, both.mT @ both, atol=1e-9 * float(whole.abs().max()), rtol=0)
+    reference = torch.stack(
+        [
+            torch.func.jacrev(lambda x, b=b: residual_of(row(rows, b), body(x[None], size))[0])(pose[b])
+            for b in range(len(pose))
+        ]
+    )
+    assert_close(whole[:, :-1, :-1], reference.mT @ reference, atol=1e-9 * float(whole.abs().max()), rtol=0)
+
+
+def row(rows, b):
+    return Rows(*(getattr(rows, name)[b : b + 1] for name in Rows.__dataclass_fields__))
+
+
+@each_kind
+def test_loss_and_gradient_with_prior_and_limits_are_those_of_the_residuals(kind):
+    body, truth, size, rows = scene(kind)
+    pose = truth + 0.7 * torch.randn_like(truth)
+    assert ((pose < body.low) | (pose > body.high)).any()
+    precision = torch.rand_like(pose) * 30
+    precision[:, 4] = 0
+    prior, config = PosePrior(truth, precision), FittingConfig(limit_sd=0.2)
+    equations = equations_by_moments(body, size, rows, prior, config, body(truth, size))
+    loss, gradient, normal = equations(pose)
+    residual = pose_residual(body, size, rows, prior, config)
+    assert_close(loss, 0.5 * (residual(pose) ** 2).sum(1), atol=0, rtol=1e-11)
+    step = 1e-6 * torch.eye(24, dtype=pose.dtype)
+    slope = torch.stack([(residual(pose + d) ** 2 - residual(pose - d) ** 2).sum(1) / 4e-6 for d in step], -1)
+    assert_close(gradient, slope, atol=1e-7 * float(slope.abs().max()), rtol=0)
+    _, J = linearize_by_screws(body, size, rows, prior, config)(pose)
+    assert_close(normal, J.mT @ J, atol=1e-10 * float(normal.abs().max()), rtol=0)
+
+
+@pytest.mark.parametrize("degrees", [0, 3, 20])
+def test_single_precision(degrees):
+    """Residuals of 5 mm, 3 m away, with the sums made so far off: exact there, and nearly so at the answer."""
+    body, truth, size, rows = scene(per_part=60)
+    start = truth + torch.deg2rad(torch.tensor(degrees)) * torch.randn_like(truth).sign()
+    single = body_of(dtype=torch.float32)
+    few = Rows(rows.part, rows.local.float(), rows.target.float(), rows.direction.float())
+    sums = sums_of(few, single(start.float(), size.float()))
+    for pose, loss_off, gradient_off in ((start, 3e-6, 5e-5), (truth, 1e-3, 2e-4)):
+        exact = MomentEquations(sums_of(rows, body(start, size)), body.part_moves)(body(pose, size))
+        ours = MomentEquations(sums, single.part_moves)(single(pose.float(), size.float())).double()
+        assert_close(ours[:, -1, -1], exact[:, -1, -1], atol=0, rtol=loss_off)
+        assert_close(ours[:, :-1, :-1], exact[:, :-1, :-1], atol=1e-6 * float(exact.abs().max()), rtol=0)
+        # What rounding of the gradient is worth: sqrt of the diagonal times sqrt of the loss is its greatest.
+        size_of = (exact.diagonal(dim1=1, dim2=2)[:, :-1] * exact[:, -1:, -1]).sqrt()
+        assert ((ours - exact)[:, :-1, -1].abs() / size_of).max() < gradient_off
+
+
+def test_a_batch_in_chunks_equals_one_by_one(monkeypatch):
+    body, truth, size, rows = scene(batch=5)
+    posed = body(truth + 0.1, size)
+    whole = sums_of(rows, posed).matrix
+    monkeypatch.setattr(moment, "CHUNK", 2 * rows.part.shape[1])
+    assert_close(sums_of(rows, posed).matrix, whole, atol=1e-9, rtol=1e-12)
+    for b in range(5):
+        alone = sums_of(row(rows, b), body(truth[b : b + 1] + 0.1, size))
+        assert_close(alone.matrix[0], whole[b], atol=1e-9, rtol=1e-12)
+
+
+def test_a_broken_frame_stays_alone():
+    body, truth, size, rows = scene(batch=3, dtype=torch.float32)
+    posed = body(truth, size)
+    target = rows.target.clone()
+    target[1, 7] = torch.nan
+    both = [
+        MomentEquations(sums_of(r, posed), body.part_moves)(posed)
+        for r in (rows, replace(rows, target=target))
+    ]
+    assert torch.equal(both[0][[0, 2]], both[1][[0, 2]])  # to the bit
+    assert both[1][1, -1, -1].isnan()
+
+
+def test_no_rows_say_nothing():
+    body, truth, size, rows = scene()
+    none = Rows(*(getattr(rows, name)[:, :0] for name in Rows.__dataclass_fields__))
+    posed = body(truth, size)
+    assert (MomentEquations(sums_of(none, posed), body.part_moves)(posed) == 0).all()
