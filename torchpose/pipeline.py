@@ -38,8 +38,15 @@ from torchpose.registration.likelihood import (
 )
 from torchpose.registration.silhouette import nearest_inside
 from torchpose.registration.size import SizeConfig, fit_size, stack_observations
-from torchpose.registration.start import StartConfig, Starter
-from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
+from torchpose.registration.start import StartConfig, Starter, select
+from torchpose.registration.vem import (
+    Observation,
+    Registrar,
+    Registration,
+    RegistrationConfig,
+    stack_registrations,
+)
+from torchpose.tracking.smoother import Message, Smoother, SmoothingConfig
 from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
 from torchpose.vision.background import (
     BackgroundConfig,
@@ -102,6 +109,7 @@ class PoseConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     start: StartConfig = field(default_factory=StartConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     height: float = 0.0  # m, of the person; 0 measures it
     size: SizeConfig = field(default_factory=SizeConfig)
     size_frames: int = 4  # of the recording, from which height and proportions are measured
@@ -322,6 +330,7 @@ class FramePose:
     registration: Registration | None
     sight: Sight | None
     problem: str = ""  # what was wrong with the frame
+    observation: Observation | None = None  # what registration saw, until the frame is smoothed
 
 
 class StereoToPose(nn.Module):
@@ -348,6 +357,7 @@ class StereoToPose(nn.Module):
         registrar = Registrar(self.body, config.registration)
         starter = Starter(self.body, config.start, config.registration)
         self.tracker = Tracker(self.body, config.tracking, registrar, starter)
+        self.smoother = Smoother(self.body, registrar, config.smoothing)
         self.register_buffer("size", self.body.default_size(1), persistent=False)
         self.stopwatch = self.eyes.stopwatch
         self._seen: dict[int, Sight] = {}
@@ -451,7 +461,22 @@ class StereoToPose(nn.Module):
             tracked = self.tracker(frame.time_s, observation, sight.faces, self.size, sight.cut)
             if tracked.registration is not None and self.config.colour.strength > 0:
                 self.colour.learn(self.evidence(sight), tracked.registration.belief, tracked.registration.distance)
-        return FramePose(frame.index, frame.time_s, tracked.status, tracked.registration, sight)
+        return FramePose(frame.index, frame.time_s, tracked.status, tracked.registration, sight, "", observation)
+
+    def smooth(self, frames: list[FramePose], before: Message | None = None) -> list[FramePose]:
+        """The same frames with poses that past and coming frames agree on; those without a pose stay without."""
+        found = [i for i, frame in enumerate(frames) if frame.registration is not None]
+        if self.config.smoothing.rounds == 0 or not found:
+            return frames
+        with self.stopwatch.measure("smoothing"):
+            observation = stack_observations([frames[i].observation for i in found])
+            time_s = torch.tensor([frames[i].time_s for i in found], dtype=torch.float64)
+            tracked = stack_registrations([frames[i].registration for i in found])
+            smooth = self.smoother(observation, time_s, tracked, self.size, before)
+        answer = list(frames)
+        for row, i in enumerate(found):
+            answer[i] = replace(frames[i], registration=select(smooth, torch.tensor(row)))
+        return answer
 
     def sequence(self, frames: list[FramePose]) -> PoseSequence:
         """The frames' numbers, as they are written: NaN wherever there is no pose."""

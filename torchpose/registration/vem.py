@@ -4,6 +4,7 @@ Left-camera frame; metres and radians. A batch holds frames, or several starts o
 shared by all rows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -147,7 +148,7 @@ class Registrar(nn.Module):
             full = self.with_rest(prior, support)
             solution = fit_pose(self.body, pose, size, rows, full, config.fitting)
             pose, status = solution.value, solution.status
-        return self._result(observation, pose, size, prior, torch.stack(bounds), status)
+        return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status)
 
     def correspond(self, posed: PosedBody, observation: Observation) -> FootPoint:
         """The model's point that answers for each data point, on every part."""
@@ -238,7 +239,7 @@ class Registrar(nn.Module):
         mean = (prior.precision * prior.mean + rest * toward) / precision.clamp_min(1e-12)
         return PosePrior(mean, precision)
 
-    def _result(
+    def evaluate(
         self,
         observation: Observation,
         pose: Float[Tensor, "batch parameters"],
@@ -271,6 +272,13 @@ class Registrar(nn.Module):
         return Registration(
             pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
         )
+
+
+def stack_registrations(found: Sequence[Registration]) -> Registration:
+    """Registrations of single frames as one batch; of the bounds only the last is kept."""
+    names = [name for name in Registration.__dataclass_fields__ if name != "bound"]
+    values = {name: torch.cat([getattr(one, name) for one in found]) for name in names}
+    return Registration(**values, bound=torch.cat([one.bound[-1:] for one in found], 1))
 
 
 def _rows(value: Tensor, batch: int) -> Tensor:

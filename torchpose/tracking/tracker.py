@@ -145,7 +145,6 @@ class Tracker(nn.Module):
         if self._in_doubt(found, stray, time_s):
             # First the limbs: where one moved too fast to follow, its points are there without a part.
             better = self.starter.refresh(observation, found.pose, size)
-            print('SEARCH',time_s,'stray',stray,'known',self._known_stray,'score',float(found.score),float(better.score),'stray after',self._stray(better))
             if bool(is_finite(better)[0]) and bool(better.score < found.score):
                 found = better
             else:
