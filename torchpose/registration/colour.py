@@ -21,10 +21,10 @@ LOW, HIGH = (0.0, -48.0, -48.0), (100.0, 48.0, 48.0)  # what the bins span in CI
 @dataclass(frozen=True)
 class ColourConfig:
     strength: float = 1.0  # power of p(colour | part) / p(colour); 0 switches the term off
-    floor: float = 0.1  # share of each part's colours that may be anybody's: the ratio never falls below it
+    floor: float = 0.03  # share of each part's colours that may be anybody's: the ratio never falls below it
     near: float = 0.04  # m from its part's surface, within which a point teaches that part its colour
     trust: float = 40.0  # points, from which a part's colours count as much as the person's own mixture
-    memory: float = 20.0  # frames, over which what was learned fades
+    memory: float = 150.0  # frames, over which what was learned fades
 
     def __post_init__(self) -> None:
         if self.strength < 0 or not 0 < self.floor < 1:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
 from torchpose.geometry import exp_rotation
+from torchpose.registration.fitting import PosePrior
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
 from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
@@ -97,6 +98,7 @@ class Starter(nn.Module):
         observation: Observation,
         pose: Float[Tensor, "1 parameters"],
         size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior | None = None,
     ) -> Registration:
         """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
         few = _thin(observation, self.config.points)
@@ -105,7 +107,7 @@ class Starter(nn.Module):
         for own, best in zip(self.limb_search.limbs, limbs[:, 0], strict=True):
             together[:, own] = best[own]
         starts = torch.cat([pose, together, limbs.flatten(0, 1)])
-        return self._search(observation, starts, size, self.registrar.config.sigma_first)
+        return self._search(observation, starts, size, self.registrar.config.sigma_first, prior)
 
     def _search(
         self,
@@ -113,18 +115,22 @@ class Starter(nn.Module):
         starts: Float[Tensor, "starts parameters"],
         size: Float[Tensor, "#batch sizes"],
         sigma: float,
+        prior: PosePrior | None = None,
     ) -> Registration:
         """Every start is fitted on a few points, the limbs of the good ones are exchanged in all pairs, and the best
         few combinations are fitted on all points. The registration with the least misfit is returned."""
         few = _thin(observation, self.config.points)
-        rough = self.coarse(few, starts, size, rounds=self.config.rounds, sigma_first=sigma)
+        rough = self.coarse(few, starts, size, _each(prior, len(starts)), self.config.rounds, sigma)
         misfit = self._score(rough)
         arms = self._exchange(rough.pose, misfit, ("upper_arm", "forearm"))
         legs = self._exchange(rough.pose, misfit, ("thigh", "shank"))
         combined = torch.cat([rough.pose, arms, legs])
-        again = self.coarse(few, combined, size, rounds=1, sigma_first=self.registrar.config.sigma_last)
+        last = self.registrar.config.sigma_last
+        again = self.coarse(few, combined, size, _each(prior, len(combined)), 1, last)
         best = self._score(again).topk(min(self.config.finalists, len(combined)), largest=False).indices
-        final = self.registrar(observation, again.pose[best], size, rounds=self.config.final_rounds)
+        final = self.registrar(
+            observation, again.pose[best], size, _each(prior, len(best)), self.config.final_rounds
+        )
         return select(final, self._score(final).argmin())
 
     def _score(self, found: Registration) -> Float[Tensor, " starts"]:
@@ -206,6 +212,11 @@ def select(registration: Registration, row: Tensor) -> Registration:
     return Registration(
         **{name: value[row][None] for name, value in picked.items()}, bound=bound[:, row][:, None]
     )
+
+
+def _each(prior: PosePrior | None, batch: int) -> PosePrior | None:
+    """The same prior for every start."""
+    return None if prior is None else PosePrior(prior.mean.expand(batch, -1), prior.precision.expand(batch, -1))
 
 
 def _directions(

@@ -42,6 +42,7 @@ class TrackingConfig:
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
+    look_around: float = 0.25  # s after which limbs are sought elsewhere although nothing seems wrong
     memory: float = 2.0  # s after which a lost person is forgotten
 
     def __post_init__(self) -> None:
@@ -86,7 +87,7 @@ class Tracker(nn.Module):
         self._velocity: Tensor | None = None  # per second
         self._time = 0.0
         self._known_stray = 0.0
-        self._searched = -math.inf
+        self._looked = -math.inf  # when limbs were last sought elsewhere, s
         self._failed = -math.inf  # when a search last found nothing, s
 
     def state(self) -> dict[str, Tensor]:
@@ -139,16 +140,17 @@ class Tracker(nn.Module):
             self._remember(found, time_s)
             return TrackedFrame(TrackStatus.partial if cut else TrackStatus.tracked, found)
         status = TrackStatus.partial if cut else TrackStatus.tracked
-        found = self._follow(observation, size, time_s)
+        predicted, prior = self._expect(time_s)
+        found = self._follow(observation, size, predicted, prior)
         stray = self._stray(found)
-        # Points that stayed without a part after a search (a bag, a skirt) are no reason for another one.
-        if self._in_doubt(found, stray, time_s):
-            # First the limbs: where one moved too fast to follow, its points are there without a part.
-            better = self.starter.refresh(observation, found.pose, size)
+        # Points that stayed without a part after a search (a bag, a skirt) are no reason for another one at once.
+        strayed = stray > max(self.config.stray_share, 1.5 * self._known_stray)
+        if strayed or not self.acceptable(found) or time_s - self._looked >= self.config.look_around:
+            self._looked = time_s
+            # First the limbs: where one moved too fast to follow, it is elsewhere.
+            better = self.starter.refresh(observation, found.pose, size, prior)
             if bool(is_finite(better)[0]) and bool(better.score < found.score):
                 found = better
-            else:
-                self._searched = time_s
             self._known_stray = self._stray(found)
         else:
             self._known_stray = min(self._known_stray, stray)
@@ -162,10 +164,8 @@ class Tracker(nn.Module):
         self._remember(found, time_s)
         return TrackedFrame(status, found)
 
-    def _follow(
-        self, observation: Observation, size: Float[Tensor, "#batch sizes"], time_s: float
-    ) -> Registration:
-        """Register from the prediction and from the last pose, and keep what fits better."""
+    def _expect(self, time_s: float) -> tuple[Float[Tensor, "1 parameters"], PosePrior]:
+        """Where the last frames say that the pose is now, and how surely."""
         assert self._pose is not None
         elapsed = max(time_s - self._time, 1e-3)
         predicted = self._pose
@@ -173,16 +173,22 @@ class Tracker(nn.Module):
             predicted = self._pose + self.config.velocity * elapsed * self._velocity
         sd = torch.full_like(predicted, self.config.joint_speed_sd * elapsed)
         sd[:, :6] = self.config.root_speed_sd * elapsed
-        starts = torch.cat([predicted, self._pose])
-        prior = PosePrior(predicted.expand_as(starts), (sd**-2).expand_as(starts))
-        both = self.registrar(observation, starts, size, prior)
-        return select(both, both.score.nan_to_num(nan=torch.inf).argmin())
+        return predicted, PosePrior(predicted, sd**-2)
 
-    def _in_doubt(self, found: Registration, stray: float, time_s: float) -> bool:
-        if not self.acceptable(found):
-            return True
-        waited = time_s - self._searched >= self.config.retry
-        return stray > self.config.stray_share and (waited or stray > 1.5 * self._known_stray)
+    def _follow(
+        self,
+        observation: Observation,
+        size: Float[Tensor, "#batch sizes"],
+        predicted: Float[Tensor, "1 parameters"],
+        prior: PosePrior,
+    ) -> Registration:
+        """Register from the prediction and from the last pose, and keep what fits better."""
+        assert self._pose is not None
+        starts = torch.cat([predicted, self._pose])
+        both = self.registrar(
+            observation, starts, size, PosePrior(prior.mean.repeat(2, 1), prior.precision.repeat(2, 1))
+        )
+        return select(both, both.score.nan_to_num(nan=torch.inf).argmin())
 
     def _stray(self, found: Registration) -> float:
         """Share of the points that are believed to be of no part."""
