@@ -187,9 +187,10 @@ class Clock:
 
 def compile_stages(registrar: Registrar) -> None:
     """The stages as compiled functions in place of the methods; the loop about them stays as it is."""
-    registrar.body.compile()
-    for stage in ("correspond", "label", "rows"):
-        setattr(registrar, stage, torch.compile(getattr(registrar, stage), dynamic=False))
+    registrar.body.compile(dynamic=False)
+    # Sigma changes from round to round: where every number is fixed, each would be compiled anew.
+    for stage, dynamic in (("correspond", False), ("label", None), ("rows", False)):
+        setattr(registrar, stage, torch.compile(getattr(registrar, stage), dynamic=dynamic))
 
 
 @dataclass(frozen=True)
