@@ -312,6 +312,20 @@ def test_a_broken_row_has_no_gradient_and_leaves_the_others_theirs():
             assert_close(mine.grad[[0, 2]], theirs.grad[[0, 2]], atol=1e-12, rtol=1e-9)
 
 
+def test_a_prior_that_says_nothing_has_a_finite_gradient():
+    """Precision 0, whose root has no derivative: some parameters' or all."""
+    body, start, size, rows, prior = noisy_problem()
+    for last in (6, 24):
+        precision = prior.precision.clone()
+        precision[:, :last] = 0
+        inputs = inputs_of(rows, size, PosePrior(prior.mean, precision))
+        config = FittingConfig(lm=CONVERGED)
+        answer(body, start, config, rows.part, *inputs).value.sum().backward()
+        assert all(x.grad.isfinite().all() for x in inputs)
+        assert inputs[1].grad.any()
+        assert (inputs[4].grad[:, :last] == 0).all()
+
+
 def test_rows_join_in_order():
     body = body_of()
     pose = random_pose(body)

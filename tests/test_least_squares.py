@@ -242,6 +242,16 @@ class TestStatus:
         assert torch.equal(solution.value[0], start[0])
         assert_close(solution.value[1], torch.zeros(2, dtype=F64), atol=1e-6, rtol=0)
 
+    def test_a_normal_matrix_that_overflows_is_not_finite(self) -> None:
+        """Residual and gradient are still finite there."""
+
+        def linearize(x: Tensor) -> tuple[Tensor, Tensor]:
+            return 1e-60 * x, torch.tensor([[[1e200]], [[1.0]]], dtype=F64)
+
+        solution = levenberg_marquardt(linearize, torch.ones(2, 1, dtype=F64))
+        assert solution.status.tolist() == [Status.NON_FINITE, Status.CONVERGED]
+        assert (solution.normal[0] == 0).all()
+
     def test_a_trial_that_is_not_finite_is_refused(self) -> None:
         """log's argument must stay positive; the first Gauss-Newton step from 10 goes far below 0."""
         solution = levenberg_marquardt(

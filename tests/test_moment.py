@@ -118,6 +118,19 @@ def test_single_precision(degrees):
         assert ((ours - exact)[:, :-1, -1].abs() / size_of).max() < gradient_off
 
 
+def test_a_loss_of_nothing_is_not_negative_in_single_precision():
+    """Sums made 10 degrees off cancel at the answer of exact rows; rounding would take half of them below 0."""
+    body = body_of(dtype=torch.float32)
+    truth, size = random_pose(body, 32), body.default_size(1)
+    rows = rows_of(body, truth, size)
+    start = truth + 0.2 * torch.randn_like(truth)
+    silent = PosePrior(truth, torch.zeros_like(truth))
+    equations = equations_by_moments(body, size, rows, silent, FittingConfig(limit_sd=0.0), body(start, size))
+    loss = equations(truth)[0]
+    assert (loss >= 0).all()
+    assert (loss < 1e-5 * equations(start)[0]).all()
+
+
 def test_a_batch_in_chunks_equals_one_by_one(monkeypatch):
     body, truth, size, rows = scene(batch=5)
     posed = body(truth + 0.1, size)

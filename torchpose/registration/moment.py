@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.body.model import PosedBody
-from torchpose.geometry import hat
+from torchpose.geometry import GENERATORS
 
-# Rows whose products are held at once, 100 numbers each: larger tables leave the cache, at three times the cost.
+# Rows whose products are held at once, 100 numbers each: larger tables leave the cache and take twice the time.
 CHUNK = 2**14
 # Of a symmetric 4 x 4 matrix ten entries are enough.
 UPPER = torch.triu_indices(4, 4)
@@ -34,6 +34,7 @@ def _places() -> Int[Tensor, "169"]:
 
 
 PLACES = _places()
+BOTTOM = torch.tensor([0.0, 0.0, 0.0, 1.0])  # a frame's fourth row
 SLIDES = 3  # the first parameters of a pose move the body along their axes, the others turn it about them
 
 
@@ -91,7 +92,7 @@ class MomentEquations:
         frames = _frames(posed, moments.pivot)
         B, K = frames.shape[:2]
         # A parameter changes T by its twist (hat(w) | v) times (T; 0 0 0 1).
-        bottom = frames.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(B, 1, K, 4)
+        bottom = BOTTOM.to(frames).expand(B, 1, K, 4)
         square = torch.cat([frames.transpose(1, 2), bottom], 1).flatten(2)  # (B, 4, 4 K)
         change = _twists(posed, moments.pivot).flatten(1, 2) @ square
         # The last column is how far each part has moved since the sums were made.
@@ -115,4 +116,4 @@ def _twists(posed: PosedBody, pivot: Tensor) -> Float[Tensor, "batch parameters 
     origins = (posed.screw_origins - pivot)[:, SLIDES:]
     w = torch.cat([torch.zeros_like(slide), turn], 1)
     v = torch.cat([slide, torch.linalg.cross(origins, turn)], 1)
-    return torch.cat([hat(w), v[..., None]], -1)
+    return torch.cat([(w @ GENERATORS.to(w)).unflatten(2, (3, 3)), v[..., None]], -1)
