@@ -42,6 +42,7 @@ class TrackingConfig:
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
+    search_slack: float = 3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
     look_around: float = 0.25  # s after which limbs are sought elsewhere although nothing seems wrong
     memory: float = 2.0  # s after which a lost person is forgotten
 
@@ -148,7 +149,8 @@ class Tracker(nn.Module):
         if strayed or not self.acceptable(found) or time_s - self._looked >= self.config.look_around:
             self._looked = time_s
             # First the limbs: where one moved too fast to follow, it is elsewhere.
-            better = self.starter.refresh(observation, found.pose, size, prior)
+            loose = PosePrior(prior.mean, prior.precision / self.config.search_slack**2)
+            better = self.starter.refresh(observation, found.pose, size, loose)
             if bool(is_finite(better)[0]) and bool(better.score < found.score):
                 found = better
             self._known_stray = self._stray(found)
