@@ -26,7 +26,7 @@ from torch import Tensor
 from torchpose.body.angle import limb_angles
 from torchpose.body.model import BodyModel
 from torchpose.cli import InferConfig, load_config
-from torchpose.pipeline import Eyes, FramePose, Sight, StereoToPose
+from torchpose.pipeline import Eyes, FramePose, Sight, SmoothingWindow, StereoToPose
 from torchpose.recording import Frame, open_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
 from torchpose.vision.points import sample_grid
@@ -184,13 +184,15 @@ def measure(
     if "size" in oracles:
         model.size = true_size(model.body, truth)
     results: list[FramePose] = []
+    window = SmoothingWindow(model)
     begin = time.process_time()
     for position in range(min(len(recording), frames or len(recording))):
         frame = recording[position]
         labels.index = frame.index
         if "start" in oracles and position == 0:
             model.tracker.begin(true_pose(model.body, truth, frame.index), frame.time_s)
-        results.append(model.follow(frame))
+        results += window.push(model.follow(frame))
+    results += window.flush()
     total = time.process_time() - begin
     sequence = model.sequence(results)
     index = sequence.frame

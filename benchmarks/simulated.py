@@ -33,7 +33,7 @@ from torchpose.body.superquadric import DisplayModel, Person
 from torchpose.cli import InferConfig, load_config
 from torchpose.export import PoseSequence
 from torchpose.geometry import angle_between
-from torchpose.pipeline import Eyes, EyesConfig, FramePose, Sight, StereoToPose
+from torchpose.pipeline import Eyes, EyesConfig, Sight, SmoothingWindow, StereoToPose
 from torchpose.recording import Frame, spread_positions
 from torchpose.synthesis.depth import MatchedFrame, MatcherNoise, Scene, cast_depth, spoil
 from torchpose.synthesis.motion import MotionConfig, lowest, perform, random_stream
@@ -209,7 +209,7 @@ def look(matched: MatchedFrame, box: Float[Tensor, "4"], sampling: SamplingConfi
     cloud = sample_grid(depth, silhouette, CAMERA, sampling)
     blank = depth.new_zeros(1, 1, 1, 1).expand(1, 3, *depth.shape[1:])
     edge = torch.cat([silhouette[0, [0, -1]].flatten(), silhouette[0, :, [0, -1]].flatten()])
-    return Sight(blank, depth, silhouette, cloud, faces, bool(cloud.mask.any()), bool(edge.any()))
+    return Sight(blank, depth, silhouette, cloud, faces, bool(cloud.mask.any()), bool(edge.any()), False)
 
 
 def follow(take: Take, config: InferConfig) -> tuple[PoseSequence, dict[str, float]]:
@@ -220,7 +220,10 @@ def follow(take: Take, config: InferConfig) -> tuple[PoseSequence, dict[str, flo
     spread = spread_positions(len(take.sights), config.pose.size_frames)
     model.size = model.measure_size([take.sights[i] for i in spread])
     seconds = {"size": time.process_time() - begin}
-    poses: list[FramePose] = [model.follow(take.frame(i)) for i in range(len(take.sights))]
+    window, poses = SmoothingWindow(model), []
+    for i in range(len(take.sights)):
+        poses += window.push(model.follow(take.frame(i)))
+    poses += window.flush()
     return model.sequence(poses), seconds | dict(model.stopwatch.seconds)
 
 

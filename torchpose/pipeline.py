@@ -7,7 +7,7 @@ metres and radians.
 import math
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -127,6 +127,7 @@ class Sight:
     faces: Faces
     present: bool  # somebody is there
     cut: bool  # the silhouette meets the image's border
+    coloured: bool = True  # False: `images` are a picture of the depth
 
 
 @dataclass(frozen=True)
@@ -317,7 +318,8 @@ class Eyes(nn.Module):
             faces = self.find_faces(images, silhouette, depth, self.camera, last.face if last else None)
         self.last = LastSight(frame.time_s, silhouette, matched, faces.memory)
         present = int(cloud.mask.sum()) >= self.config.min_points
-        return Sight(images, depth, silhouette, cloud, faces, present, _touches_border(silhouette[0]))
+        cut = _touches_border(silhouette[0])
+        return Sight(images, depth, silhouette, cloud, faces, present, cut, frame.left is not None)
 
 
 @dataclass(frozen=True)
@@ -368,6 +370,7 @@ class StereoToPose(nn.Module):
         return self.body.axes.device
 
     def evidence(self, sight: Sight) -> Evidence:
+        """A sight as the likelihoods take it."""
         return Evidence(sight.images, sight.silhouette, sight.cloud, sight.faces)
 
     def observe(self, sight: Sight) -> Observation:
@@ -390,6 +393,7 @@ class StereoToPose(nn.Module):
         self.learn_background(recording)
         self.tracker.forget()
         self.eyes.last = None
+        self.colour.forget()
         frames = readable_frames(recording, spread_positions(len(recording), self.config.size_frames))
         # These frames come again in their turn; what was seen of them is kept until then.
         self._seen = {frame.index: self.eyes(frame, self.device) for frame in frames}
@@ -401,29 +405,30 @@ class StereoToPose(nn.Module):
         size = self.body.size_of_height(self.config.height or self.measure_height(sights))
         if self.config.size.rounds == 0:
             return size
-        found, kept = [], []
+        self.colour.forget()
+        fits = []
         for sight in sights:
             if sight.present:
-                observation = self.observe(sight)
-                fit = self.tracker.starter(observation, sight.faces, size)
-                if self.tracker.acceptable(fit):
-                    found.append((observation, fit)), kept.append((sight, sight.faces))
-        if not found:
+                found = self.tracker.starter(self.observe(sight), sight.faces, size)
+                if self.tracker.acceptable(found):
+                    fits.append((sight, found))
+        if not fits:
             return size
-        self.colour.forget()
-        if self.config.colour.strength > 0:
-            for _ in range(2):
-                again = []
-                for (sight, _), (_, fit) in zip(kept, found, strict=True):
-                    self.colour.learn(self.evidence(sight), fit.belief, fit.distance)
-                for (sight, faces), (_, fit) in zip(kept, found, strict=True):
-                    observation = self.observe(sight)
-                    best = self.tracker.starter(observation, faces, size)
-                    again.append((observation, best))
-                found = again
-        observation = stack_observations([observation for observation, _ in found])
-        poses = torch.cat([fit.pose for _, fit in found])
-        return fit_size(self.tracker.registrar, observation, poses, size, self.config.size)[0]
+        # What the parts' colours say once all frames have taught them.
+        for sight, found in fits:
+            self.learn_colours(sight, found)
+        observations = [self.observe(sight) for sight, _ in fits]
+        again = [
+            self.tracker.starter.refresh(observation, found.pose, size)
+            for observation, (_, found) in zip(observations, fits, strict=True)
+        ]
+        poses = torch.cat([found.pose for found in again])
+        return fit_size(self.tracker.registrar, stack_observations(observations), poses, size, self.config.size)[0]
+
+    def learn_colours(self, sight: Sight, found: Registration) -> None:
+        """Let a frame's fit teach which colours the parts have."""
+        if self.config.colour.strength > 0 and sight.coloured:
+            self.colour.learn(self.evidence(sight), found.belief, found.distance)
 
     def measure_height(self, sights: list[Sight]) -> float:
         """The person's height, m: from the head's top to the lowest point, the greatest of the frames.
@@ -439,9 +444,11 @@ class StereoToPose(nn.Module):
         return min(max(measured + 0.03, 0.95 * self.body.height), 1.2 * self.body.height)
 
     def forward(self, recording: Recording) -> Iterator[FramePose]:
-        """Poses of a prepared recording's frames, in order."""
+        """Poses of a prepared recording's frames, in order and smoothed."""
+        window = SmoothingWindow(self)
         for position in range(len(recording)):
-            yield self.step(recording, position)
+            yield from window.push(self.step(recording, position))
+        yield from window.flush()
 
     def step(self, recording: Recording, position: int) -> FramePose:
         """The pose of one frame, the next in order. A frame that cannot be read is lost, and says why."""
@@ -459,24 +466,49 @@ class StereoToPose(nn.Module):
         with self.stopwatch.measure("registration"):
             observation = self.observe(sight) if sight.present else None
             tracked = self.tracker(frame.time_s, observation, sight.faces, self.size, sight.cut)
-            if tracked.registration is not None and self.config.colour.strength > 0:
-                self.colour.learn(self.evidence(sight), tracked.registration.belief, tracked.registration.distance)
+            if tracked.registration is not None:
+                self.learn_colours(sight, tracked.registration)
         return FramePose(frame.index, frame.time_s, tracked.status, tracked.registration, sight, "", observation)
 
-    def smooth(self, frames: list[FramePose], before: Message | None = None) -> list[FramePose]:
-        """The same frames with poses that past and coming frames agree on; those without a pose stay without."""
+    def smooth(
+        self, frames: list[FramePose], before: Message | None = None, last: int = -1
+    ) -> tuple[list[FramePose], Message | None]:
+        """The same frames with poses that past and coming frames agree on; those without a pose stay without.
+
+        `before` is what earlier frames say. Returned with the frames: what those up to the one at `last` say to later ones.
+        """
         found = [i for i, frame in enumerate(frames) if frame.registration is not None]
         if self.config.smoothing.rounds == 0 or not found:
-            return frames
+            return frames, before
         with self.stopwatch.measure("smoothing"):
-            observation = stack_observations([frames[i].observation for i in found])
-            time_s = torch.tensor([frames[i].time_s for i in found], dtype=torch.float64)
-            tracked = stack_registrations([frames[i].registration for i in found])
-            smooth = self.smoother(observation, time_s, tracked, self.size, before)
+            observations = [o for o in (frames[i].observation for i in found) if o is not None]
+            registrations = [r for r in (frames[i].registration for i in found) if r is not None]
+            smooth = self.smoother(
+                stack_observations(observations),
+                torch.tensor([frames[i].time_s for i in found], dtype=torch.float64),
+                stack_registrations(registrations),
+                self.size,
+                before,
+            )
         answer = list(frames)
         for row, i in enumerate(found):
-            answer[i] = replace(frames[i], registration=select(smooth, torch.tensor(row)))
-        return answer
+            answer[i] = replace(frames[i], registration=select(smooth.registration, torch.tensor(row)))
+        told = [row for row, i in enumerate(found) if i <= last % len(frames)]
+        return answer, smooth.message(told[-1]) if told else before
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next frame starts from, as tensors: the person's size and colours, and the last frame's memory."""
+        parts = {"": {"size": self.size, "colours": self.colour.counts}}
+        parts |= {"tracker_": self.tracker.state(), "eyes_": self.eyes.state()}
+        return {prefix + name: value.clone() for prefix, part in parts.items() for name, value in part.items()}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state`."""
+        self.size = state["size"].to(self.size)
+        self.colour.counts = state["colours"].to(self.size)
+        for prefix, part in (("tracker_", self.tracker), ("eyes_", self.eyes)):
+            own = {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}
+            part.restore(own, self.device)
 
     def sequence(self, frames: list[FramePose]) -> PoseSequence:
         """The frames' numbers, as they are written: NaN wherever there is no pose."""
@@ -508,6 +540,41 @@ class StereoToPose(nn.Module):
             pose=spread(pose),
             pose_covariance=spread(covariance),
         )
+
+
+class SmoothingWindow:
+    """Frames wait here until those that follow have had their say: pushed one by one, returned smoothed.
+
+    `state` is what a run that was interrupted goes on from: that of the model after the last frame returned.
+    """
+
+    def __init__(self, model: StereoToPose, state: Mapping[str, Tensor] | None = None):
+        self.model = model
+        self.before = None if not state or "message_pose" not in state else Message.from_state(state)
+        self.state: dict[str, Tensor] = {}
+        self._next: dict[str, Tensor] = {}
+        self._waiting: list[FramePose] = []
+
+    def push(self, frame: FramePose) -> list[FramePose]:
+        """Take the next frame; the frames that are ready, often none."""
+        config = self.model.config.smoothing
+        self._waiting.append(frame)
+        if len(self._waiting) == config.stretch:
+            self._next = self.model.state()
+        if len(self._waiting) < config.stretch + (config.ahead if config.rounds else 0):
+            return []
+        return self._smooth(config.stretch)
+
+    def flush(self) -> list[FramePose]:
+        """The frames that are left at the end of the recording."""
+        self._next = self.model.state()
+        return self._smooth(len(self._waiting)) if self._waiting else []
+
+    def _smooth(self, count: int) -> list[FramePose]:
+        smooth, self.before = self.model.smooth(self._waiting, self.before, count - 1)
+        self._waiting = self._waiting[count:]
+        self.state = self._next | ({} if self.before is None else self.before.state())
+        return [replace(frame, observation=None) for frame in smooth[:count]]
 
 
 def _upright_extent(sight: Sight) -> float:

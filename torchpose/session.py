@@ -34,14 +34,12 @@ from torchpose.export import (
     write_summary,
 )
 from torchpose.figures import Overlay, draw_overlay, plot_angles
-from torchpose.pipeline import FramePose, StereoToPose, depth_picture
+from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose, depth_picture
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 
 CHECKED = 3  # frames whose rows are compared
-PART = 50  # frames between two savings: what an interruption costs at the most
 _PARTS, _STAMP = "parts", "settings.txt"  # of a run that is not finished: their folder, and whose they are
-_EYES = "eyes_"  # before the names of the eyes' state, beside the tracker's
 _SHOWN = ("elbow_flexion_left", "elbow_flexion_right", "knee_flexion_left", "knee_flexion_right")
 
 
@@ -73,6 +71,7 @@ class Session:
         self.settings, self.version, self.rows_before = settings, version, rows_before
         self.parts = output / _PARTS
         self.problems: list[str] = []
+        self.kept: dict[str, Tensor] = {}  # what an interrupted run goes on from
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
         """Recover all poses and write `poses.csv`, `poses.npz`, `overlay.mp4`, `angles.png` and `summary.json`.
@@ -128,21 +127,16 @@ class Session:
         if not files:
             return 0
         state = np.load(files[-1].with_name(files[-1].name.replace("poses", "state")))
-        tensors = {name: torch.from_numpy(state[name]) for name in state.files}
-        self.model.size = tensors.pop("size").to(self.model.device)
-        seen = {
-            name.removeprefix(_EYES): tensors.pop(name) for name in list(tensors) if name.startswith(_EYES)
-        }
-        self.model.eyes.restore(seen, self.model.device)
-        self.model.tracker.restore(tensors)
+        self.kept = {name: torch.from_numpy(state[name]) for name in state.files}
+        self.model.restore(self.kept)
         return sum(len(read_poses_npz(file)) for file in files)
 
     def _files(self) -> list[Path]:
         return sorted(self.parts.glob("poses_*.npz"))
 
     def _follow(self, done: int, count: int) -> None:
-        """Frames `done` to `count`, saved every `PART` of them."""
-        waiting: list[FramePose] = []
+        """Frames `done` to `count`, saved whenever a stretch of them is smooth."""
+        window = SmoothingWindow(self.model, self.kept)
         with tqdm(
             total=count, initial=done, unit="frame", disable=not sys.stderr.isatty(), leave=False
         ) as bar:
@@ -150,14 +144,15 @@ class Session:
                 result = self.model.step(self.recording, position)
                 if result.problem:
                     self.problems.append(f"frame {result.index}: {result.problem}")
-                waiting.append(result)
+                ready = window.push(result)
+                ready += window.flush() if position == count - 1 else []
                 bar.set_postfix_str(result.status.value)
                 bar.update()
-                if len(waiting) == PART or position == count - 1:
-                    self._save(position + 1, waiting)
-                    waiting = []
+                if ready:
+                    done += len(ready)
+                    self._save(done, ready, window.state)
 
-    def _save(self, end: int, frames: list[FramePose]) -> None:
+    def _save(self, end: int, frames: list[FramePose], kept: Mapping[str, Tensor]) -> None:
         """One part: poses, labelled points, and last what the next frame starts from."""
         num = max((f.sight.cloud.mask.shape[1] for f in frames if f.sight is not None), default=1)
         pixels, labels = (
@@ -171,8 +166,6 @@ class Session:
                 labels[i, seen] = frame.registration.belief[0].argmax(0).cpu()[seen]
         with replacing(self.parts / f"points_{end:08d}.npz") as partial:
             np.savez(partial, pixels=pixels, labels=labels)
-        kept = self.model.tracker.state() | {"size": self.model.size}
-        kept |= {_EYES + name: value for name, value in self.model.eyes.state().items()}
         state = {name: value.cpu().numpy() for name, value in kept.items()}
         with replacing(self.parts / f"state_{end:08d}.npz") as partial:
             np.savez_compressed(partial, allow_pickle=False, **state)

@@ -5,6 +5,7 @@ Gauss-Newton problem whose matrix is block tridiagonal; its inverse's diagonal b
 Rauch-Tung-Striebel smoother for these equations. Left-camera frame, metres, radians and seconds.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,11 +28,15 @@ class SmoothingConfig:
     steps: int = 2  # of Gauss and Newton in each
     joint_drift: float = 1.0  # rad that a joint goes astray in a second, growing with the root of time
     root_drift: float = 0.5  # m and rad, the same for the root
+    stretch: int = 50  # frames that are smoothed at once
+    ahead: int = 12  # coming frames that they hear of
     rest_time: float = 2.0  # s after which an unseen limb forgets where it was
 
     def __post_init__(self) -> None:
         if self.sweeps < 0 or self.rounds < 0 or self.steps < 1:
             raise ValueError(f"sweeps and rounds must not be negative and steps at least 1, got {self}")
+        if not 0 <= self.ahead < self.stretch:
+            raise ValueError(f"0 <= ahead < stretch must hold, in frames, got {self.ahead} and {self.stretch}")
         for name in ("apart", "joint_drift", "root_drift", "rest_time"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -44,6 +49,29 @@ class Message:
     time_s: float
     pose: Float[Tensor, " parameters"]
     precision: Float[Tensor, "parameters parameters"]
+
+    def state(self) -> dict[str, Tensor]:
+        """As tensors, to go on from after an interruption."""
+        time_s = torch.tensor(self.time_s, dtype=torch.float64)
+        return {"message_time_s": time_s, "message_pose": self.pose, "message_precision": self.precision}
+
+    @staticmethod
+    def from_state(state: Mapping[str, Tensor]) -> "Message":
+        """What `state` gave."""
+        return Message(float(state["message_time_s"]), state["message_pose"], state["message_precision"])
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A stretch of frames."""
+
+    registration: Registration  # batch = frames; covariances given all of them
+    time_s: Float[Tensor, " frames"]
+    filtered: Float[Tensor, "frames parameters parameters"]  # precision of each pose given the frames up to it
+
+    def message(self, frame: int) -> Message:
+        """What the frames up to this one say of its pose. Its mean has heard of the later ones, its precision has not."""
+        return Message(float(self.time_s[frame]), self.registration.pose[frame], self.filtered[frame])
 
 
 class Smoother(nn.Module):
@@ -60,20 +88,20 @@ class Smoother(nn.Module):
         tracked: Registration,
         size: Float[Tensor, "#frames sizes"],
         before: Message | None = None,
-    ) -> Registration:
+    ) -> Smoothed:
         """Registrations of the frames, batch = frames, with the covariances of the whole stretch."""
         best = tracked
         pull = self._drift(time_s, tracked.pose)
         for _ in range(self.config.sweeps):
             best = self._try_neighbours(observation, best, pull, size)
-        pose = best.pose
-        pose[:, ANGLES] = _unwound(pose[:, ANGLES], before)
-        covariance = best.covariance
+        unwound = _unwound(best.pose[:, ANGLES], before)
+        pose = torch.cat([best.pose[:, :3], unwound, best.pose[:, 6:]], 1)
+        covariance = filtered = best.covariance
         for _ in range(self.config.rounds):
-            pose, covariance = self._fit(observation, pose, size, pull, time_s, before)
+            pose, covariance, filtered = self._fit(observation, pose, size, pull, time_s, before)
         nothing = PosePrior(pose, torch.zeros_like(pose))
         result = self.registrar.evaluate(observation, pose, size, nothing, best.bound, best.status)
-        return replace(result, covariance=covariance)
+        return Smoothed(replace(result, covariance=covariance), time_s, filtered)
 
     def _drift(self, time_s: Tensor, like: Tensor) -> Float[Tensor, "frames_1 parameters"]:
         """Precision of the steps from frame to frame."""
@@ -110,7 +138,7 @@ class Smoother(nn.Module):
 
     def _fit(
         self, observation: Observation, pose: Tensor, size: Tensor, pull: Tensor, time_s: Tensor, before: Message | None
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         registrar, config = self.registrar, self.config
         posed = self.body(pose, size)
         foot = registrar.correspond(posed, observation)
@@ -128,7 +156,7 @@ class Smoother(nn.Module):
         for _ in range(config.steps):
             g, blocks, off = self._chain(pose, gradient, normal, pull, time_s, first)
             damped = blocks + torch.diag_embed(damping * blocks.diagonal(dim1=1, dim2=2) + 1e-6)
-            step, _ = solve_chain(damped, off, -g)
+            step, _, _ = solve_chain(damped, off, -g)
             trial = pose + step.clamp(-0.5, 0.5)
             new_loss, new_gradient, new_normal = equations(trial)
             new_total = new_loss.sum() + self._chain_loss(trial, pull, time_s, first)
@@ -139,8 +167,9 @@ class Smoother(nn.Module):
                 damping *= 30
         _, blocks, off = self._chain(pose, gradient, normal, pull, time_s, first)
         eye = torch.eye(pose.shape[1], dtype=pose.dtype, device=pose.device)
-        _, covariance = solve_chain(blocks + 1e-6 * eye, off, torch.zeros_like(pose))
-        return pose, covariance
+        _, covariance, filtered = solve_chain(blocks + 1e-6 * eye, off, torch.zeros_like(pose))
+        ahead = torch.cat([pull, torch.zeros_like(pull[:1])]) if len(pull) else torch.zeros_like(pose)
+        return pose, covariance, filtered - torch.diag_embed(ahead)
 
     def _link(self, time_s: Tensor, before: Message, like: Tensor) -> Tensor:
         """Precision of the first frame's pose about that of the frame before."""
@@ -177,17 +206,19 @@ class Smoother(nn.Module):
 
 def solve_chain(
     blocks: Float[Tensor, "frames p p"], beside: Float[Tensor, "frames_1 p"], right: Float[Tensor, "frames p"]
-) -> tuple[Float[Tensor, "frames p"], Float[Tensor, "frames p p"]]:
-    """Solution of a symmetric block tridiagonal system, and the diagonal blocks of the matrix's inverse.
+) -> tuple[Float[Tensor, "frames p"], Float[Tensor, "frames p p"], Float[Tensor, "frames p p"]]:
+    """Solution of a symmetric block tridiagonal system, the diagonal blocks of the matrix's inverse, and the diagonal
+    blocks that elimination leaves (a frame's precision given those before it).
 
     The blocks beside the diagonal are diagonal themselves, `beside`. Elimination forward and substitution back, as the
     smoother of Rauch, Tung and Striebel.
     """
     T = len(blocks)
-    inverse, value = [torch.linalg.inv(blocks[0])], [right[0]]
+    left, inverse, value = [blocks[0]], [torch.linalg.inv(blocks[0])], [right[0]]
     for t in range(1, T):
         b = beside[t - 1]
-        inverse.append(torch.linalg.inv(blocks[t] - b[:, None] * inverse[-1] * b))
+        left.append(blocks[t] - b[:, None] * inverse[-1] * b)
+        inverse.append(torch.linalg.inv(left[-1]))
         value.append(right[t] - b * (inverse[t - 1] @ value[-1]))
     x, covariance = [inverse[-1] @ value[-1]], [inverse[-1]]
     for t in range(T - 2, -1, -1):
@@ -195,7 +226,7 @@ def solve_chain(
         x.append(inverse[t] @ (value[t] - b * x[-1]))
         gain = inverse[t] * b
         covariance.append(inverse[t] + gain @ covariance[-1] @ gain.T)
-    return torch.stack(x[::-1]), torch.stack(covariance[::-1])
+    return torch.stack(x[::-1]), torch.stack(covariance[::-1]), torch.stack(left)
 
 
 def _unwound(angles: Float[Tensor, "frames 3"], before: Message | None) -> Float[Tensor, "frames 3"]:

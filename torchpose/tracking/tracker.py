@@ -4,6 +4,7 @@ Times are in seconds, poses in metres and radians. The next frame starts from th
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -38,7 +39,6 @@ class TrackingConfig:
     joint_speed_sd: float = 8.0  # rad/s by which a joint departs from the prediction
     root_speed_sd: float = 2.0  # m/s and rad/s, the same for the root
     accept_misfit: float = 0.055  # m: a pose that fits worse is none
-    doubt_misfit: float = 0.030  # m: a worse fit is also sought anew, and a clearly better one taken
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
@@ -53,10 +53,11 @@ class TrackingConfig:
             "joint_speed_sd",
             "root_speed_sd",
             "accept_misfit",
-            "doubt_misfit",
             "stray_distance",
             "stray_share",
             "retry",
+            "look_around",
+            "search_slack",
             "memory",
         ):
             if not getattr(self, name) > 0:
@@ -98,15 +99,16 @@ class Tracker(nn.Module):
         state = {"pose": self._pose, "time": torch.tensor(self._time, dtype=torch.float64)}
         if self._velocity is not None:
             state["velocity"] = self._velocity
-        return state | {"known_stray": torch.tensor(self._known_stray, dtype=torch.float64)}
+        memory = {"known_stray": self._known_stray, "looked": self._looked}
+        return state | {name: torch.tensor(value, dtype=torch.float64) for name, value in memory.items()}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
+    def restore(self, state: Mapping[str, Tensor], device: torch.device | None = None) -> None:
         """Go on from a `state`."""
         self.forget()
         if state:
             self._pose, self._time = state["pose"].to(self.body.axes), float(state["time"])
             self._velocity = state["velocity"].to(self.body.axes) if "velocity" in state else None
-            self._known_stray = float(state["known_stray"])
+            self._known_stray, self._looked = float(state["known_stray"]), float(state["looked"])
 
     def begin(self, pose: Float[Tensor, "1 parameters"], time_s: float) -> None:
         """Take a known pose as the last one: the next frame follows it instead of searching."""
