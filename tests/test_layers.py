@@ -38,6 +38,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "body": ("skeleton", "model", "ellipsoid", "superquadric", "angle"),
     "registration": (
         "likelihood",
+        "colour",
         "labelling",
         "geodesic",
         "moment",
@@ -45,9 +46,10 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "silhouette",
         "vem",
         "size",
+        "limb_search",
         "start",
     ),
-    "tracking": ("kalman", "meanshift", "tracker"),
+    "tracking": ("kalman", "meanshift", "smoother", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
         *("inference", "hmm", "codebook", "recognizer", "diary"),
