@@ -23,6 +23,7 @@ FRAMES = 7
 EMPTY, BROKEN = 4, 5  # a frame with nobody in it, and one that cannot be read
 # Small and quick: the person's height is given, so no other frames are searched for proportions.
 QUICK = ["pose.height=1.75", "pose.size.rounds=0", "pose.size_frames=1", "pose.start.final_rounds=4"]
+QUICK += ["pose.smoothing.stretch=2", "pose.smoothing.ahead=1"]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_every_file_is_there_and_nothing_else(result: Path):
     names = {path.name for path in result.iterdir()}
-    assert names == {"poses.csv", "poses.npz", "overlay.mp4", "angles.png", "summary.json"}
+    assert names == {"poses.csv", "poses.npz", "person.yaml", "overlay.mp4", "angles.png", "summary.json"}
 
 
 def test_the_table_has_the_contract_s_columns_and_a_row_a_frame(result: Path):
@@ -132,7 +133,6 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    monkeypatch.setattr(session, "PART", 2)
     step = tp.StereoToPose.step
     command = [f"recording={folder}", f"output={tmp_path}", *QUICK]
     with monkeypatch.context() as patch:
@@ -259,9 +259,9 @@ def test_a_live_camera_is_recorded_and_then_run(
     assert infer_main(command) == 2
     assert "recording runs that, and fresh=true or another output records anew" in capsys.readouterr().err
     # An interrupted run goes on with what was recorded, and with nothing that another command recorded.
-    command, step = [*command[: -len(QUICK) - 1], "max_frames=3", *QUICK], tp.StereoToPose.step
+    command = [*command[: -len(QUICK) - 1], "max_frames=3", *QUICK, "pose.smoothing.ahead=0"]
+    step = tp.StereoToPose.step
     with monkeypatch.context() as patch:
-        patch.setattr(session, "PART", 2)
         patch.setattr(tp.StereoToPose, "step", interrupted_at(2))
         assert infer_main([*command, "fresh=true"]) == 130
     assert "the same command again goes on" in capsys.readouterr().err

@@ -65,7 +65,7 @@ def test_the_bound_is_below_the_evidence_of_all_labellings(coloured):
         potential, near, mask, grid = random_case(num=6, labels=3, rows=3, columns=3, padding=2)
         _, joint = log_joint(potential, near, 6, 0.5)
         config = LabellingConfig(sweeps=LONG, potts=0.5, coloured=coloured)
-        bound = mean_field(potential, near, mask, config, grid).bound
+        bound = mean_field(potential, near, mask, config, grid, history=True).bound
         assert (bound < joint.logsumexp(0)).all()
         assert bound[-1] > joint.logsumexp(0) - 0.5  # nats: not just any number below it
 
@@ -118,7 +118,7 @@ def test_with_colours_the_bound_never_falls(potts, labels):
     cases = [random_case(num=35, labels=labels, spread=0.5) for _ in range(10)]
     potential, near, mask, grid = (torch.cat(parts) for parts in zip(*cases, strict=True))
     config = LabellingConfig(sweeps=15, potts=potts, coloured=True)
-    bound = mean_field(potential, near, mask, config, grid).bound
+    bound = mean_field(potential, near, mask, config, grid, history=True).bound
     assert bound.shape == (16, 10)
     assert (bound.diff(dim=0) >= -1e-9).all()
     assert (bound[-1] > bound[0]).all()
@@ -130,9 +130,9 @@ def test_without_colours_it_can_fall():
     potential = torch.tensor([[[0.1, 0.0], [0.0, 0.1]]], dtype=torch.float64)
     grid = torch.tensor([[[0, 0], [0, 1]]])
     config = LabellingConfig(sweeps=9, potts=6.0)
-    assert (mean_field(potential, near, mask, config).bound.diff(dim=0) < -1e-3).any()
+    assert (mean_field(potential, near, mask, config, history=True).bound.diff(dim=0) < -1e-3).any()
     coloured = replace(config, coloured=True)
-    assert (mean_field(potential, near, mask, coloured, grid).bound.diff(dim=0) >= -1e-9).all()
+    assert (mean_field(potential, near, mask, coloured, grid, history=True).bound.diff(dim=0) >= -1e-9).all()
 
 
 def test_points_of_one_colour_are_never_neighbours():

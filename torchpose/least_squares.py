@@ -17,14 +17,12 @@ Linearize = Callable[
     tuple[Float[Tensor, "batch residuals"], Float[Tensor, "batch residuals unknowns"]],
 ]
 # Half the sum of squares, its gradient J^T r and J^T J: all that the minimiser needs of the residuals.
-NormalEquations = Callable[
-    [Float[Tensor, "batch unknowns"]],
-    tuple[
-        Float[Tensor, " batch"],
-        Float[Tensor, "batch unknowns"],
-        Float[Tensor, "batch unknowns unknowns"],
-    ],
+Normal = tuple[
+    Float[Tensor, " batch"],
+    Float[Tensor, "batch unknowns"],
+    Float[Tensor, "batch unknowns unknowns"],
 ]
+NormalEquations = Callable[[Float[Tensor, "batch unknowns"]], Normal]
 
 
 class Status(IntEnum):
@@ -73,7 +71,10 @@ def levenberg_marquardt(
 
 
 def minimize(
-    equations: NormalEquations, start: Float[Tensor, "batch unknowns"], config: LMConfig = LMConfig()
+    equations: NormalEquations,
+    start: Float[Tensor, "batch unknowns"],
+    config: LMConfig = LMConfig(),
+    first: Normal | None = None,
 ) -> Solution:
     """Minimise a sum of squares for each row of `start` on its own, by Levenberg and Marquardt's method.
 
@@ -84,9 +85,10 @@ def minimize(
     Args:
         equations: maps x (B, P) to the loss |r|^2 / 2 (B,), J^T r (B, P) and J^T J (B, P, P).
         start: first guess, a problem a row.
+        first: the equations at `start`, if they are at hand.
     """
     x = start
-    loss, gradient, normal = equations(x)
+    loss, gradient, normal = equations(x) if first is None else first
     # A column of J that is not finite shows on the diagonal of J^T J.
     finite = loss.isfinite() & gradient.isfinite().all(1) & _diagonal(normal).isfinite().all(1)
     active = finite

@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
@@ -37,7 +38,7 @@ from torchpose.registration.likelihood import (
     appearance_potential,
 )
 from torchpose.registration.silhouette import nearest_inside
-from torchpose.registration.size import SizeConfig, fit_size, stack_observations
+from torchpose.registration.size import SizeConfig, fit_size, read_size, stack_observations
 from torchpose.registration.start import StartConfig, Starter, select
 from torchpose.registration.vem import (
     Observation,
@@ -110,6 +111,7 @@ class PoseConfig:
     start: StartConfig = field(default_factory=StartConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
+    person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them
     height: float = 0.0  # m, of the person; 0 measures it
     size: SizeConfig = field(default_factory=SizeConfig)
     size_frames: int = 4  # of the recording, from which height and proportions are measured
@@ -389,7 +391,8 @@ class StereoToPose(nn.Module):
         self.eyes.learn_background(recording.background(), recording, self.device)
 
     def prepare(self, recording: Recording) -> None:
-        """Learn the recording's empty scene and the person's size, and forget any other person."""
+        """Learn the recording's empty scene and the person's size and colours, and forget any other person."""
+        known = read_size(Path(self.config.person), self.body) if self.config.person else None
         self.learn_background(recording)
         self.tracker.forget()
         self.eyes.last = None
@@ -398,12 +401,19 @@ class StereoToPose(nn.Module):
         # These frames come again in their turn; what was seen of them is kept until then.
         self._seen = {frame.index: self.eyes(frame, self.device) for frame in frames}
         with self.stopwatch.measure("size"):
-            self.size = self.measure_size(list(self._seen.values()))
+            self.size = self.measure_size(list(self._seen.values()), known)
 
-    def measure_size(self, sights: list[Sight]) -> Float[Tensor, "1 sizes"]:
-        """Lengths and girths of the person in these frames; the body file's where no pose is found in any."""
-        size = self.body.size_of_height(self.config.height or self.measure_height(sights))
-        if self.config.size.rounds == 0:
+    def measure_size(
+        self, sights: list[Sight], known: Float[Tensor, "1 sizes"] | None = None
+    ) -> Float[Tensor, "1 sizes"]:
+        """Lengths and girths of the person in these frames; the body file's where no pose is found in any.
+
+        Sizes that are `known` stay. The parts' colours are learned on the way.
+        """
+        size = known
+        if size is None:
+            size = self.body.size_of_height(self.config.height or self.measure_height(sights))
+        if self.config.size.rounds == 0 and self.config.colour.strength == 0:
             return size
         self.colour.forget()
         fits = []
@@ -414,16 +424,20 @@ class StereoToPose(nn.Module):
                     fits.append((sight, found))
         if not fits:
             return size
-        # What the parts' colours say once all frames have taught them.
         for sight, found in fits:
             self.learn_colours(sight, found)
+        if known is not None or self.config.size.rounds == 0:
+            return size
+        # Once all frames have taught the parts' colours, these speak, too.
         observations = [self.observe(sight) for sight, _ in fits]
         again = [
             self.tracker.starter.refresh(observation, found.pose, size)
             for observation, (_, found) in zip(observations, fits, strict=True)
         ]
         poses = torch.cat([found.pose for found in again])
-        return fit_size(self.tracker.registrar, stack_observations(observations), poses, size, self.config.size)[0]
+        return fit_size(
+            self.tracker.registrar, stack_observations(observations), poses, size, self.config.size
+        )[0]
 
     def learn_colours(self, sight: Sight, found: Registration) -> None:
         """Let a frame's fit teach which colours the parts have."""
@@ -468,14 +482,16 @@ class StereoToPose(nn.Module):
             tracked = self.tracker(frame.time_s, observation, sight.faces, self.size, sight.cut)
             if tracked.registration is not None:
                 self.learn_colours(sight, tracked.registration)
-        return FramePose(frame.index, frame.time_s, tracked.status, tracked.registration, sight, "", observation)
+        return FramePose(
+            frame.index, frame.time_s, tracked.status, tracked.registration, sight, "", observation
+        )
 
     def smooth(
         self, frames: list[FramePose], before: Message | None = None, last: int = -1
     ) -> tuple[list[FramePose], Message | None]:
         """The same frames with poses that past and coming frames agree on; those without a pose stay without.
 
-        `before` is what earlier frames say. Returned with the frames: what those up to the one at `last` say to later ones.
+        `before` is what earlier frames say. Returned beside them: what the frames up to `last` say to later ones.
         """
         found = [i for i, frame in enumerate(frames) if frame.registration is not None]
         if self.config.smoothing.rounds == 0 or not found:
@@ -500,7 +516,9 @@ class StereoToPose(nn.Module):
         """What the next frame starts from, as tensors: the person's size and colours, and the last frame's memory."""
         parts = {"": {"size": self.size, "colours": self.colour.counts}}
         parts |= {"tracker_": self.tracker.state(), "eyes_": self.eyes.state()}
-        return {prefix + name: value.clone() for prefix, part in parts.items() for name, value in part.items()}
+        return {
+            prefix + name: value.clone() for prefix, part in parts.items() for name, value in part.items()
+        }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from a `state`."""

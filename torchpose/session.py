@@ -36,6 +36,7 @@ from torchpose.export import (
 from torchpose.figures import Overlay, draw_overlay, plot_angles
 from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose, depth_picture
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
+from torchpose.registration.size import write_size
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 
 CHECKED = 3  # frames whose rows are compared
@@ -74,7 +75,7 @@ class Session:
         self.kept: dict[str, Tensor] = {}  # what an interrupted run goes on from
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
-        """Recover all poses and write `poses.csv`, `poses.npz`, `overlay.mp4`, `angles.png` and `summary.json`.
+        """Recover all poses and write the files of an output folder.
 
         Returns the summary. `fresh` forgets what an interrupted run left.
         """
@@ -89,6 +90,7 @@ class Session:
             write_poses_csv(self.output / "poses.csv", sequence)
             write_poses_npz(self.output / "poses.npz", sequence)
             plot_angles(self.output / "angles.png", sequence)
+            write_size(self.output / "person.yaml", self.model.body, self.model.size)
             self._draw(sequence, labelled)
         summary = self._summary(sequence, time.perf_counter() - begin, count - done)
         summary |= {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before}
@@ -266,7 +268,7 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
         f"time              {summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame",
         "CPU ms a frame    "
         + ", ".join(f"{name} {ms:.0f}" for name, ms in summary["cpu_ms_per_frame"].items()),
-        f"results           {output}/ poses.csv, poses.npz, overlay.mp4, angles.png, summary.json",
+        f"results           {output}/ poses.csv, poses.npz, person.yaml, overlay.mp4, angles.png, summary.json",
     ]
     problems = summary["problems"]
     lines += [f"problem           {problem}" for problem in problems[:5]]

@@ -59,10 +59,14 @@ class Rows:
 
     def points(self, posed: PosedBody) -> Float[Tensor, "batch rows 3"]:
         """The model's points in the camera's frame, m."""
-        index = self.part[..., None]
-        frames = posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3))
-        centers = posed.centers.gather(1, index.expand(-1, -1, 3))
-        return (frames @ self.local[..., None])[..., 0] + centers
+        places = torch.cat([posed.frames, posed.centers[..., None]], -1)  # (B, K, 3, 4)
+        # With the rows last in memory every operation runs along them: faster than a small product for each.
+        own = places.flatten(2).mT.gather(2, self.part[:, None].expand(-1, 12, -1)).unflatten(1, (3, 4))
+        return ((own[:, :, :3] * self.local.mT[:, None]).sum(2) + own[:, :, 3]).mT
+
+    def residual(self, posed: PosedBody) -> Float[Tensor, "batch rows"]:
+        """How far each row is from its target along its direction, no unit."""
+        return (self.direction.mT * (self.target - self.points(posed)).mT).sum(1)
 
     @staticmethod
     def cat(*rows: "Rows") -> "Rows":
@@ -142,10 +146,37 @@ def _minimize(
 ) -> Solution:
     if config.jacobian is JacobianKind.autograd:
         equations = normal_equations(linearize_by_autograd(pose_residual(body, size, rows, prior, config)))
-    else:
-        posed = body(start, size) if posed is None else posed
-        equations = equations_by_moments(body, size, rows, prior, config, posed)
-    return minimize(equations, start, config.lm)
+        return minimize(equations, start, config.lm)
+    posed = body(start, size) if posed is None else posed
+    by_moments = equations_by_moments(body, size, rows, prior, config, posed)
+    return minimize(by_moments, start, config.lm, by_moments.at(start, posed))
+
+
+@dataclass(frozen=True)
+class PoseEquations:
+    """The normal equations of rows, prior and limits as a function of the pose; see `NormalEquations`."""
+
+    body: BodyModel
+    size: Float[Tensor, "#batch sizes"]
+    of_rows: MomentEquations
+    prior: PosePrior
+    config: FittingConfig
+
+    def __call__(self, pose: Float[Tensor, "batch parameters"]) -> tuple[Tensor, Tensor, Tensor]:
+        return self.at(pose, self.body(pose, self.size))
+
+    def at(
+        self, pose: Float[Tensor, "batch parameters"], posed: PosedBody
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The same with the body `posed` at this pose, if it is at hand."""
+        residual, slope = pose_terms(self.body, pose, self.prior, self.config)
+        # Each term depends on one parameter: its share of J^T J is diagonal.
+        whole = self.of_rows(posed)
+        by_pose = (slope * residual).sum(1)
+        loss = whole[:, -1, -1] + (residual * residual).sum((1, 2))
+        normal = whole[:, :-1, :-1] + torch.diag_embed((slope * slope).sum(1))
+        # Where the sum of squares is 0 its terms still cancel only up to rounding.
+        return 0.5 * loss.clamp_min(0), whole[:, :-1, -1] + by_pose, normal
 
 
 def equations_by_moments(
@@ -155,20 +186,10 @@ def equations_by_moments(
     prior: PosePrior,
     config: FittingConfig,
     posed: PosedBody,
-) -> NormalEquations:
+) -> PoseEquations:
     """The normal equations of rows, prior and limits; the rows are summed once, near where the body is `posed`."""
-    residual = (rows.direction * (rows.target - rows.points(posed))).sum(-1)
-    moments = sum_rows(rows.part, rows.local, rows.direction, residual, posed)
-    of_rows = MomentEquations(moments, body.part_moves)
-
-    def equations(pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        residual, jacobian = _pose_terms(body, pose, prior, config)
-        columns = torch.cat([jacobian, residual[..., None]], 2)
-        whole = torch.baddbmm(of_rows(body(pose, size)), columns.mT, columns)
-        # Where the sum of squares is 0 its terms still cancel only up to rounding.
-        return 0.5 * whole[:, -1, -1].clamp_min(0), whole[:, :-1, -1], whole[:, :-1, :-1]
-
-    return equations
+    moments = sum_rows(rows.part, rows.local, rows.direction, rows.residual(posed), posed)
+    return PoseEquations(body, size, MomentEquations(moments, body.part_moves), prior, config)
 
 
 def pose_residual(
@@ -177,9 +198,8 @@ def pose_residual(
     """All residuals as a function of the pose: rows, prior, limits."""
 
     def residual(pose: Tensor) -> Tensor:
-        posed = body(pose, size)
-        gap = rows.target - rows.points(posed)
-        return torch.cat([(rows.direction * gap).sum(-1), _pose_terms(body, pose, prior, config)[0]], 1)
+        terms, _ = pose_terms(body, pose, prior, config)
+        return torch.cat([rows.residual(body(pose, size)), terms.flatten(1)], 1)
 
     return residual
 
@@ -215,15 +235,16 @@ def linearize_posed(
     sliding = torch.cat([torch.zeros_like(posed.screw_axes), posed.screw_axes], -1)
     screws = torch.cat([sliding[:, :3], turning[:, 3:]], 1)
     moves = body.part_moves.to(wrench)[rows.part]  # (B, R, P)
-    residual, jacobian = _pose_terms(body, pose, prior, config)
+    residual, slope = pose_terms(body, pose, prior, config)
     gap = (rows.direction * (rows.target - points)).sum(-1)
-    return torch.cat([gap, residual], 1), torch.cat([-(wrench @ screws.mT) * moves, jacobian], 1)
+    jacobian = torch.cat([-(wrench @ screws.mT) * moves, torch.diag_embed(slope).flatten(1, 2)], 1)
+    return torch.cat([gap, residual.flatten(1)], 1), jacobian
 
 
-def _pose_terms(
-    body: BodyModel, pose: Tensor, prior: PosePrior, config: FittingConfig
-) -> tuple[Float[Tensor, "batch terms"], Float[Tensor, "batch terms parameters"]]:
-    """Residuals of the prior and of broken limits, and their Jacobian."""
+def pose_terms(
+    body: BodyModel, pose: Float[Tensor, "batch parameters"], prior: PosePrior, config: FittingConfig
+) -> tuple[Float[Tensor, "batch terms parameters"], Float[Tensor, "batch terms parameters"]]:
+    """Residuals of the prior and of broken limits, one a parameter, and their derivatives by it; no unit."""
     # The root of 0 has no derivative.
     silent = prior.precision == 0
     slopes = [torch.where(silent, 1.0, prior.precision).sqrt() * ~silent]
@@ -232,4 +253,4 @@ def _pose_terms(
         over = pose - torch.minimum(torch.maximum(pose, body.low), body.high)
         slopes.append((over != 0).to(pose) / config.limit_sd)
         residuals.append(over / config.limit_sd)
-    return torch.cat(residuals, 1), torch.cat([torch.diag_embed(slope) for slope in slopes], 1)
+    return torch.stack(residuals, 1), torch.stack(slopes, 1)

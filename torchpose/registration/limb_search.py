@@ -88,8 +88,7 @@ class LimbSearch(nn.Module):
         score = share * (torch.logaddexp(rest.repeat_interleave(C, 0), inside) * cloud.mask).sum(1)
         if registrar.config.rim.weight > 0:
             rows = silhouette_rows(limb, observation.nearest, observation.camera, registrar.config.rim)
-            gap = (rows.direction * (rows.target - rows.points(limb))).sum(-1)
-            score = score - 0.5 * (gap * gap).sum(1)
+            score = score - 0.5 * rows.residual(limb).square().sum(1)
         return score.unflatten(0, (L, C))
 
     def _rest_of_body(self, observation: Observation, pose: Tensor, size: Tensor) -> Float[Tensor, "limbs num"]:

@@ -98,7 +98,10 @@ def overhang(
     posed: PosedBody, nearest: Float[Tensor, "#batch height width 2"], camera: StereoCamera, config: RimConfig
 ) -> Float[Tensor, " batch"]:
     """How far the body's rims stand out of the mask, m: mean over the rim points, each at most `reach`."""
-    rows = silhouette_rows(posed, nearest, camera, config)
-    gap = (rows.direction * (rows.target - rows.points(posed))).sum(-1).abs()
-    metres = gap * config.sd / max(config.weight, 1e-12) ** 0.5
+    return overhang_of(silhouette_rows(posed, nearest, camera, config).residual(posed), config)
+
+
+def overhang_of(residual: Float[Tensor, "batch rims"], config: RimConfig) -> Float[Tensor, " batch"]:
+    """`overhang` from the residuals of the `silhouette_rows`, if they are at hand."""
+    metres = residual.abs() * config.sd / max(config.weight, 1e-12) ** 0.5
     return metres.clamp_max(config.reach).mean(1)

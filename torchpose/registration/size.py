@@ -6,11 +6,14 @@ metres.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import torch
+import yaml
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.atomic import replacing
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import LMConfig, levenberg_marquardt, linearize_by_autograd
 from torchpose.registration.fitting import PosePrior, Rows, linearize_by_screws
@@ -78,6 +81,39 @@ def fit_size(
         pose, size = problem.split(solution.value)
         size = size.clamp(SMALLEST, LARGEST)
     return size, pose
+
+
+def write_size(path: Path, body: BodyModel, size: Float[Tensor, "1 sizes"]) -> None:
+    """Save a person's sizes, factors on the body file's, as YAML that a person can read and edit."""
+    rows = {name: round(float(value), 4) for name, value in zip(body.size_names, size[0], strict=True)}
+    with replacing(path) as partial:
+        partial.write_text(
+            "# Sizes of a person: factors on the lengths and girths of the body file.\n"
+            + yaml.safe_dump(rows, sort_keys=False)
+        )
+
+
+def read_size(path: Path, body: BodyModel) -> Float[Tensor, "1 sizes"]:
+    """The sizes that `write_size` saved.
+
+    Raises ValueError, naming the file, if it is missing, has other names than the body file or senseless numbers.
+    """
+    if not path.is_file():
+        raise ValueError(
+            f"the person's file must exist, got {path}; leave `pose.person` empty to measure the person"
+        )
+    try:
+        rows = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} must be YAML with a number for each size, got: {error}") from error
+    if not isinstance(rows, dict) or set(rows) != set(body.size_names):
+        raise ValueError(
+            f"{path} must hold the sizes {list(body.size_names)}, got {rows}; measure the person anew"
+        )
+    wrong = {n: v for n, v in rows.items() if not isinstance(v, int | float) or not SMALLEST <= v <= LARGEST}
+    if wrong:
+        raise ValueError(f"sizes in {path} must lie between {SMALLEST} and {LARGEST}, got {wrong}")
+    return torch.tensor([[float(rows[name]) for name in body.size_names]]).to(body.axes)
 
 
 def size_precision(body: BodyModel, config: SizeConfig) -> Float[Tensor, "sizes sizes"]:

@@ -5,7 +5,7 @@ shared by all rows.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import torch
@@ -15,9 +15,16 @@ from torch import Tensor, nn
 from torchpose.body.ellipsoid import FootPoint, algebraic_distance, foot_point
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import Status
-from torchpose.registration.fitting import FittingConfig, PosePrior, Rows, fit_pose, linearize_by_screws
+from torchpose.registration.fitting import (
+    FittingConfig,
+    PosePrior,
+    Rows,
+    equations_by_moments,
+    fit_pose,
+    pose_terms,
+)
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
-from torchpose.registration.silhouette import RimConfig, overhang, silhouette_rows
+from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_rows
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
 
@@ -85,6 +92,15 @@ class Observation:
             )
         return Observation(cloud, _rows(self.potential, batch), self.nearest, self.camera, geodesic)
 
+    def take(self, index: Tensor) -> "Observation":
+        """Some rows of the batch, each as often as `index` names it."""
+        cloud = PointCloud(*(getattr(self.cloud, name)[index] for name in PointCloud.__dataclass_fields__))
+        nearest = self.nearest[index] if len(self.nearest) == len(self.potential) else self.nearest
+        geodesic = self.geodesic
+        if geodesic is not None:
+            geodesic = replace(geodesic, cell=geodesic.cell[index], distance=geodesic.distance[index])
+        return Observation(cloud, self.potential[index], nearest, self.camera, geodesic)
+
 
 @dataclass(frozen=True)
 class Registration:
@@ -103,6 +119,20 @@ class Registration:
     score: Float[Tensor, " batch"]  # minus the log of the joint density, up to a constant: compares starts, less is better
     bound: Float[Tensor, "rounds batch"]  # (C.8) after each VE-step, at that round's sigma
     status: Int[Tensor, " batch"]  # of the last M-step, see `Status`
+
+    def take(self, index: Tensor) -> "Registration":
+        """Some rows of the batch."""
+        names = [name for name in Registration.__dataclass_fields__ if name != "bound"]
+        return Registration(
+            **{name: getattr(self, name)[index] for name in names}, bound=self.bound[:, index]
+        )
+
+    def put(self, index: Tensor, other: "Registration") -> "Registration":
+        """With the rows at `index` replaced by those of another; of the bounds the last is kept."""
+        names = [name for name in Registration.__dataclass_fields__ if name != "bound"]
+        values = {name: getattr(self, name).index_put((index,), getattr(other, name)) for name in names}
+        bound = self.bound[-1].index_put((index,), other.bound[-1])
+        return Registration(**values, bound=bound[None])
 
 
 class Registrar(nn.Module):
@@ -146,7 +176,7 @@ class Registrar(nn.Module):
             rim = i >= rounds - config.rim.last_rounds
             rows, support = self.rows(posed, foot, labelling, observation, rim)
             full = self.with_rest(prior, support)
-            solution = fit_pose(self.body, pose, size, rows, full, config.fitting)
+            solution = fit_pose(self.body, pose, size, rows, full, config.fitting, posed)
             pose, status = solution.value, solution.status
         return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status)
 
@@ -178,54 +208,55 @@ class Registrar(nn.Module):
         rim: bool = True,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
         """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
-        belief = labelling.belief[:, : self.body.num_parts]
-        if self.config.hard:
-            best = labelling.belief.argmax(1, keepdim=True)
-            belief = torch.zeros_like(labelling.belief).scatter(1, best, 1.0)[:, : self.body.num_parts]
-            belief = belief * observation.cloud.mask[:, None]
-        rows = self._point_rows(posed, foot, belief, observation.cloud)
+        rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.rim)
             # Rims of one part move together, so they count as a few independent measurements, not as many.
             rows = Rows.cat(rows, across)
-        return rows, belief.sum(2)
+        return rows, support
 
     def _point_row_count(self, cloud: PointCloud) -> int:
         return 3 * cloud.mask.shape[1] * (1 if self.config.hard else self.body.num_parts)
 
     def _point_rows(
-        self, posed: PosedBody, foot: FootPoint, belief: Float[Tensor, "batch parts num"], cloud: PointCloud
-    ) -> Rows:
-        config = self.config
-        count = cloud.mask.sum(1).clamp_min(1)
-        weight = belief * (config.effective_points / count).clamp_max(1)[:, None, None]
-        if config.robust_sd > 0:  # Geman and McClure
-            weight = weight / (1 + (foot.residual**2).sum(-1) / config.robust_sd**2) ** 2
-        normal, residual, local = foot.normal, foot.residual, foot.local
-        part = torch.arange(belief.shape[1], device=belief.device)[None, :, None].expand_as(belief)
-        target = cloud.points[:, None].expand_as(local)
+        self, posed: PosedBody, foot: FootPoint, belief: Float[Tensor, "batch labels num"], cloud: PointCloud
+    ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
+        """Three rows for each pair of point and part, all first coordinates first; and the points on each part.
+
+        In memory the coordinates stand before the pairs, so that every operation runs along the pairs.
+        """
+        config, K = self.config, self.body.num_parts
+        B, N = cloud.mask.shape
         if config.hard:
-            best = belief.argmax(1)
-            pick = best[:, None]
-            weight, part = weight.gather(1, pick), pick
-            wide = pick[..., None].expand(-1, -1, -1, 3)
-            normal, residual, local = (x.gather(1, wide) for x in (normal, residual, local))
-            target = target[:, :1]
-        frames = (
-            posed.frames.flatten(2)
-            .gather(1, part.flatten(1)[..., None].expand(-1, -1, 9))
-            .unflatten(2, (3, 3))
-        )
-        normal = (frames @ normal.flatten(1, 2)[..., None])[..., 0]
-        scale = weight.flatten(1).sqrt() / config.noise_sd
+            best = belief.max(1).indices  # far faster than `argmax`
+            part = best.clamp_max(K - 1)
+            weight = ((best < K) & cloud.mask).to(belief)
+            support = weight.new_zeros(B, K).scatter_add(1, part, weight)
+            pick = part[:, None, None].expand(-1, 1, 3, -1)
+            local, normal, gap = (x.mT.gather(1, pick)[:, 0] for x in (foot.local, foot.normal, foot.residual))
+            target = cloud.points.mT
+        else:
+            part = torch.arange(K, device=belief.device).repeat_interleave(N).expand(B, -1)
+            weight, support = belief[:, :K].flatten(1), belief[:, :K].sum(2)
+            local, normal, gap = (x.flatten(1, 2).mT for x in (foot.local, foot.normal, foot.residual))
+            target = cloud.points.mT.repeat(1, 1, K)
+        count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
+        weight = weight * (config.effective_points / count).clamp_max(1)
+        if config.robust_sd > 0:  # Geman and McClure
+            weight = weight / (1 + gap.square().sum(1) / config.robust_sd**2) ** 2
+        # The root of 0 has no derivative; the floor gives it 0.
+        tiny = torch.finfo(weight.dtype).tiny
+        scale = torch.where(weight > 0, weight.clamp_min(tiny).sqrt(), 0.0) / config.noise_sd
+        frames = posed.frames.flatten(2).mT.gather(2, part[:, None].expand(-1, 9, -1)).unflatten(1, (3, 3))
+        normal = (frames * normal[:, None]).sum(2)
         # Along the normal the distance counts in full; along the surface only as far as asked, which lets a limb slide
         # to where it fits. A point behind the rim differs from its foot along the surface too, and counts less there.
-        eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
-        outer = normal[..., :, None] * normal[..., None, :]
-        spread = outer + config.tangential * (eye - outer)  # (B, rows, 3, 3), symmetric
-        direction = (scale[..., None, None] * spread).flatten(1, 2)
-        three = [x.flatten(1, 2).repeat_interleave(3, 1) for x in (local, target)]
-        return Rows(part.flatten(1).repeat_interleave(3, 1), three[0], three[1], direction)
+        eye = torch.eye(3, dtype=normal.dtype, device=normal.device)[..., None]
+        outer = normal[:, :, None] * normal[:, None]
+        spread = (1 - config.tangential) * outer + config.tangential * eye  # (B, 3, 3, pairs), symmetric
+        direction = (scale[:, None, None] * spread).flatten(2)
+        local, target, direction = (x.mT for x in (local.repeat(1, 1, 3), target.repeat(1, 1, 3), direction))
+        return Rows(part.repeat(1, 3), local, target, direction), support
 
     def with_rest(self, prior: PosePrior, support: Float[Tensor, "batch parts"]) -> PosePrior:
         """The prior, joined by a pull towards the rest pose on every joint below which little is seen."""
@@ -254,8 +285,8 @@ class Registrar(nn.Module):
         labelling = self.label(posed, foot, observation, config.sigma_last)
         rows, support = self.rows(posed, foot, labelling, observation)
         full = self.with_rest(prior, support)
-        residual, jacobian = linearize_by_screws(self.body, size, rows, full, config.fitting)(pose)
-        information = jacobian.mT @ jacobian
+        equations = equations_by_moments(self.body, size, rows, full, config.fitting, posed)
+        _, _, information = equations.at(pose, posed)
         factor, failed = torch.linalg.cholesky_ex(information)
         known = (failed == 0)[:, None, None]
         # cholesky_inverse raises for the whole batch where one factor is singular.
@@ -263,12 +294,14 @@ class Registrar(nn.Module):
         covariance = torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.distance.amin(1) * cloud.mask
-        # Of the residuals the points' come first; the bound stands in for them, with every label and none.
-        others = residual[:, self._point_row_count(cloud) :]
-        score = 0.5 * others.square().sum(1) - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
+        # Of the rows the points' come first; the bound stands in for them, with every label and none.
+        rims = rows.residual(posed)[:, self._point_row_count(cloud) :]
+        terms, _ = pose_terms(self.body, pose, full, config.fitting)
+        others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
+        score = others - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
         misfit = nearest.clamp_max(0.2).sum(1) / count
         if config.rim.weight > 0:
-            misfit = misfit + overhang(posed, observation.nearest, observation.camera, config.rim)
+            misfit = misfit + overhang_of(rims, config.rim)
         return Registration(
             pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
         )

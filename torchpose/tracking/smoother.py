@@ -122,7 +122,7 @@ class Smoother(nn.Module):
             other = other.clamp(0, T - 1)
             apart = (pose[other, 6:] - pose[:, 6:]).abs().amax(1) > self.config.apart
             rows = (inside & apart).nonzero()[:, 0]
-            for part in rows.split(MOST):
+            for part in rows.split(MOST) if len(rows) else ():
                 near = other[part]
                 link = pull[torch.minimum(part, near)]
                 prior = PosePrior(pose[near], link)
