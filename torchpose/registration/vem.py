@@ -116,7 +116,7 @@ class Registration:
     distance: Float[Tensor, "batch num"]  # m, to the nearest part; 0 on padding
     point_to_model: Float[Tensor, " batch"]  # m, (5.2): the mean of `distance` over the points
     misfit: Float[Tensor, " batch"]  # m, capped distances plus overhang: whether this can be the person at all
-    score: Float[Tensor, " batch"]  # minus the log of the joint density, up to a constant: compares starts, less is better
+    score: Float[Tensor, " batch"]  # nats, minus the log of the joint density: compares starts, less is better
     bound: Float[Tensor, "rounds batch"]  # (C.8) after each VE-step, at that round's sigma
     status: Int[Tensor, " batch"]  # of the last M-step, see `Status`
 

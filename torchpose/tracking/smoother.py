@@ -1,23 +1,27 @@
 """All frames of a stretch at once: each learns from its neighbours, past and coming, what it does not see itself.
 
-Variational Bayesian EM over a chain (T. 3.2.2, 6.2.1, App. B): labels given poses frame by frame, poses given labels in one
-Gauss-Newton problem whose matrix is block tridiagonal; its inverse's diagonal blocks are the poses' covariances, which is the
-Rauch-Tung-Striebel smoother for these equations. Left-camera frame, metres, radians and seconds.
+Variational Bayesian EM over a chain (T. 3.2.2, 6.2.1, App. B): labels given poses frame by frame, poses given labels in
+one Gauss-Newton problem whose matrix is block tridiagonal; its inverse's diagonal blocks are the poses' covariances,
+which is the Rauch-Tung-Striebel smoother for these equations. Left-camera frame, metres, radians and seconds.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
+from torchpose.least_squares import NormalEquations, Status
 from torchpose.registration.fitting import PosePrior, equations_by_moments
-from torchpose.registration.vem import Observation, Registrar, Registration
+from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 
 ANGLES = slice(3, 6)  # of the root, which come round again
 MOST = 48  # rows registered at once: more are no faster
+BETTER = 1.0  # nats by which a neighbour's pose must fit better to be taken
+LONGEST = 0.5  # m and rad, of a step in one unknown
+FLOOR = 1e-6  # precision of every unknown of every frame, so that none is without any
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,9 @@ class SmoothingConfig:
         if self.sweeps < 0 or self.rounds < 0 or self.steps < 1:
             raise ValueError(f"sweeps and rounds must not be negative and steps at least 1, got {self}")
         if not 0 <= self.ahead < self.stretch:
-            raise ValueError(f"0 <= ahead < stretch must hold, in frames, got {self.ahead} and {self.stretch}")
+            raise ValueError(
+                f"0 <= ahead < stretch must hold, in frames, got {self.ahead} and {self.stretch}"
+            )
         for name in ("apart", "joint_drift", "root_drift", "rest_time"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -67,11 +73,41 @@ class Smoothed:
 
     registration: Registration  # batch = frames; covariances given all of them
     time_s: Float[Tensor, " frames"]
-    filtered: Float[Tensor, "frames parameters parameters"]  # precision of each pose given the frames up to it
+    filtered: Float[
+        Tensor, "frames parameters parameters"
+    ]  # precision of each pose given the frames up to it
 
     def message(self, frame: int) -> Message:
-        """What the frames up to this one say of its pose. Its mean has heard of the later ones, its precision has not."""
+        """What the frames up to this one say of its pose: its mean has heard of later ones, its precision has not."""
         return Message(float(self.time_s[frame]), self.registration.pose[frame], self.filtered[frame])
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What ties the frames' poses: independent steps from frame to frame, and what came before the first."""
+
+    pull: Float[Tensor, "frames_1 parameters"]  # precision of the step from each frame to the next
+    before: Float[Tensor, " parameters"]  # mean of the first frame's pose as the frames before it have it
+    link: Float[Tensor, "parameters parameters"]  # precision of that; 0 says nothing
+
+    def loss(self, pose: Float[Tensor, "frames parameters"]) -> Float[Tensor, ""]:
+        """Minus the log-density of the poses, up to a constant."""
+        gap = pose[0] - self.before
+        return 0.5 * (self.pull * pose.diff(dim=0) ** 2).sum() + 0.5 * gap @ self.link @ gap
+
+    def gradient(self, pose: Float[Tensor, "frames parameters"]) -> Float[Tensor, "frames parameters"]:
+        """Derivative of `loss`."""
+        force = torch.nn.functional.pad(self.pull * pose.diff(dim=0), (0, 0, 1, 1))
+        gradient = force[:-1] - force[1:]
+        gradient[0] += self.link @ (pose[0] - self.before)
+        return gradient
+
+    def blocks(self) -> Float[Tensor, "frames parameters parameters"]:
+        """Diagonal blocks of the second derivative; those beside them are -diag(`pull`)."""
+        pull = torch.nn.functional.pad(self.pull, (0, 0, 1, 1))
+        blocks = torch.diag_embed(pull[:-1] + pull[1:])
+        blocks[0] += self.link
+        return blocks
 
 
 class Smoother(nn.Module):
@@ -89,34 +125,57 @@ class Smoother(nn.Module):
         size: Float[Tensor, "#frames sizes"],
         before: Message | None = None,
     ) -> Smoothed:
-        """Registrations of the frames, batch = frames, with the covariances of the whole stretch."""
-        best = tracked
-        pull = self._drift(time_s, tracked.pose)
+        """Registrations of the frames, batch = frames, with the covariances of the whole stretch.
+
+        A frame whose tracked pose is not finite starts from the nearest one that is and keeps status NON_FINITE; one
+        whose observation is not finite gets its neighbours' pose.
+
+        Args:
+            observation: of all frames.
+            time_s: of each frame, rising.
+            tracked: where to begin.
+            before: what the frames before this stretch say of it; None says nothing.
+        """
+        if len(time_s) != len(tracked.pose) or bool((time_s.diff() < 0).any()):
+            raise ValueError(
+                f"time_s must give one time for each of the {len(tracked.pose)} frames, rising, got {time_s.tolist()}"
+            )
+        # Before anything compares poses of neighbours: a turn of 2 pi between them is none.
+        pose = _without_gaps(tracked.pose, is_finite(tracked))
+        pose = torch.cat([pose[:, :3], _unwound(pose[:, ANGLES], before), pose[:, 6:]], 1)
+        best = replace(tracked, pose=pose)
+        chain = self._chain(time_s, pose, before)
         for _ in range(self.config.sweeps):
-            best = self._try_neighbours(observation, best, pull, size)
-        unwound = _unwound(best.pose[:, ANGLES], before)
-        pose = torch.cat([best.pose[:, :3], unwound, best.pose[:, 6:]], 1)
-        covariance = filtered = best.covariance
+            best = self._try_neighbours(observation, best, chain.pull, size)
+        pose, covariance, filtered = best.pose, best.covariance, torch.zeros_like(best.covariance)
         for _ in range(self.config.rounds):
-            pose, covariance, filtered = self._fit(observation, pose, size, pull, time_s, before)
+            equations = self._equations(observation, pose, size, time_s)
+            pose, covariance, filtered = fit_chain(equations, pose, chain, self.config.steps)
         nothing = PosePrior(pose, torch.zeros_like(pose))
-        result = self.registrar.evaluate(observation, pose, size, nothing, best.bound, best.status)
+        status = torch.where(is_finite(tracked), best.status, int(Status.NON_FINITE))
+        result = self.registrar.evaluate(observation, pose, size, nothing, best.bound, status)
         return Smoothed(replace(result, covariance=covariance), time_s, filtered)
 
-    def _drift(self, time_s: Tensor, like: Tensor) -> Float[Tensor, "frames_1 parameters"]:
-        """Precision of the steps from frame to frame."""
-        elapsed = time_s.diff().clamp_min(1e-3).to(like)
-        rate = torch.full_like(like[0], self.config.joint_drift)
+    def _chain(self, time_s: Tensor, pose: Tensor, before: Message | None) -> Chain:
+        """The poses' random walk."""
+        rate = torch.full_like(pose[0], self.config.joint_drift)
         rate[:6] = self.config.root_drift
-        return 1 / (rate**2 * elapsed[:, None])
+        pull = 1 / (rate**2 * time_s.diff().clamp_min(1e-3).to(pose)[:, None])
+        if before is None:
+            return Chain(pull, pose[0], torch.zeros_like(pose[0]).diag())
+        first = 1 / (rate**2 * max(float(time_s[0]) - before.time_s, 1e-3))
+        # (P^-1 + D^-1)^-1 for the precisions P of the pose and D of the step, where P may be singular.
+        gain = torch.linalg.solve(before.precision + first.diag(), first.diag())
+        return Chain(pull, before.pose, first.diag() - first[:, None] * gain)
 
     def _try_neighbours(
         self, observation: Observation, now: Registration, pull: Tensor, size: Tensor
     ) -> Registration:
         """Each frame that differs from a neighbour is fitted from there, too, and keeps the better fit."""
-        pose, T = now.pose, len(now.pose)
-        frames = torch.arange(T, device=pose.device)
+        T = len(now.pose)
+        frames = torch.arange(T, device=now.pose.device)
         for side in (-1, 1):
+            pose = now.pose  # with what the first side has found
             other = frames + side
             inside = (other >= 0) & (other < T)
             other = other.clamp(0, T - 1)
@@ -124,21 +183,24 @@ class Smoother(nn.Module):
             rows = (inside & apart).nonzero()[:, 0]
             for part in rows.split(MOST) if len(rows) else ():
                 near = other[part]
-                link = pull[torch.minimum(part, near)]
-                prior = PosePrior(pose[near], link)
                 # Both answers are weighed with the same prior: the neighbour on the side that is tried.
-                starts = torch.cat([pose[part], pose[near]])
+                twice = part.repeat(2)
+                prior = PosePrior(pose[near].repeat(2, 1), pull[torch.minimum(part, near)].repeat(2, 1))
                 both = self.registrar(
-                    _frames(observation, part.repeat(2)), starts, size, PosePrior(prior.mean.repeat(2, 1), prior.precision.repeat(2, 1))
+                    observation.take(twice),
+                    torch.cat([pose[part], pose[near]]),
+                    size if len(size) == 1 else size[twice],
+                    prior,
                 )
-                mine, theirs = (_take(both, slice(i * len(part), (i + 1) * len(part))) for i in range(2))
-                better = theirs.score < mine.score - 1.0
-                now = _put(now, part[better], _take(theirs, better))
+                mine, theirs = both.score.chunk(2)
+                better = theirs < mine.nan_to_num(nan=torch.inf) - BETTER
+                now = now.put(part[better], both.take(len(part) + better.nonzero()[:, 0]))
         return now
 
-    def _fit(
-        self, observation: Observation, pose: Tensor, size: Tensor, pull: Tensor, time_s: Tensor, before: Message | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _equations(
+        self, observation: Observation, pose: Tensor, size: Tensor, time_s: Tensor
+    ) -> NormalEquations:
+        """Of each frame alone, with the labels that its points have at this pose."""
         registrar, config = self.registrar, self.config
         posed = self.body(pose, size)
         foot = registrar.correspond(posed, observation)
@@ -146,62 +208,53 @@ class Smoother(nn.Module):
         rows, support = registrar.rows(posed, foot, labelling, observation)
         rest = registrar.with_rest(PosePrior(pose, torch.zeros_like(pose)), support)
         # Frame after frame an unseen limb would be drawn to rest anew: one pull in `rest_time` is meant.
-        elapsed = time_s.diff().mean().clamp(1e-3, config.rest_time) if len(time_s) > 1 else config.rest_time
-        rest = PosePrior(rest.mean, rest.precision * float(elapsed / config.rest_time))
-        equations = equations_by_moments(self.body, size, rows, rest, registrar.config.fitting, posed)
-        first = None if before is None else before
-        damping = 1e-3
+        share = 1.0
+        if len(time_s) > 1:
+            share = float(time_s.diff().mean().clamp(1e-3, config.rest_time)) / config.rest_time
+        rest = PosePrior(rest.mean, rest.precision * share)
+        return equations_by_moments(self.body, size, rows, rest, registrar.config.fitting, posed)
+
+
+def fit_chain(
+    equations: NormalEquations, start: Float[Tensor, "frames parameters"], chain: Chain, steps: int
+) -> tuple[
+    Float[Tensor, "frames parameters"],
+    Float[Tensor, "frames parameters parameters"],
+    Float[Tensor, "frames parameters parameters"],
+]:
+    """Poses after some Levenberg-Marquardt steps in all frames at once, their covariances given all frames, and their
+    precisions given the frames up to each.
+
+    Args:
+        equations: loss, gradient and normal matrix of each frame alone; a frame where they are not finite at the start
+            says nothing.
+    """
+    sound: Bool[Tensor, " frames"] | None = None
+
+    def evaluate(pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        nonlocal sound
         loss, gradient, normal = equations(pose)
-        total = loss.sum() + self._chain_loss(pose, pull, time_s, first)
-        for _ in range(config.steps):
-            g, blocks, off = self._chain(pose, gradient, normal, pull, time_s, first)
-            damped = blocks + torch.diag_embed(damping * blocks.diagonal(dim1=1, dim2=2) + 1e-6)
-            step, _, _ = solve_chain(damped, off, -g)
-            trial = pose + step.clamp(-0.5, 0.5)
-            new_loss, new_gradient, new_normal = equations(trial)
-            new_total = new_loss.sum() + self._chain_loss(trial, pull, time_s, first)
-            if bool(new_total < total):
-                pose, total, gradient, normal = trial, new_total, new_gradient, new_normal
-                damping /= 10
-            else:
-                damping *= 30
-        _, blocks, off = self._chain(pose, gradient, normal, pull, time_s, first)
-        eye = torch.eye(pose.shape[1], dtype=pose.dtype, device=pose.device)
-        _, covariance, filtered = solve_chain(blocks + 1e-6 * eye, off, torch.zeros_like(pose))
-        ahead = torch.cat([pull, torch.zeros_like(pull[:1])]) if len(pull) else torch.zeros_like(pose)
-        return pose, covariance, filtered - torch.diag_embed(ahead)
+        if sound is None:
+            sound = loss.isfinite() & gradient.isfinite().all(1) & normal.isfinite().all((1, 2))
+        gradient = torch.where(sound[:, None], gradient, 0.0) + chain.gradient(pose)
+        normal = torch.where(sound[:, None, None], normal, 0.0) + chain.blocks()
+        return torch.where(sound, loss, 0.0).sum() + chain.loss(pose), gradient, normal
 
-    def _link(self, time_s: Tensor, before: Message, like: Tensor) -> Tensor:
-        """Precision of the first frame's pose about that of the frame before."""
-        rate = torch.full_like(like[0], self.config.joint_drift)
-        rate[:6] = self.config.root_drift
-        drift = torch.diag(rate**2 * max(float(time_s[0]) - before.time_s, 1e-3))
-        return torch.linalg.inv(torch.linalg.inv(before.precision) + drift)
-
-    def _chain_loss(self, pose: Tensor, pull: Tensor, time_s: Tensor, before: Message | None) -> Tensor:
-        loss = 0.5 * (pull * pose.diff(dim=0) ** 2).sum()
-        if before is not None:
-            gap = pose[0] - before.pose
-            loss = loss + 0.5 * gap @ self._link(time_s, before, pose) @ gap
-        return loss
-
-    def _chain(
-        self, pose: Tensor, gradient: Tensor, normal: Tensor, pull: Tensor, time_s: Tensor, before: Message | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Gradient, diagonal blocks and the diagonals of the blocks beside them."""
-        force = pull * pose.diff(dim=0)
-        gradient = gradient.clone()
-        gradient[:-1] -= force
-        gradient[1:] += force
-        around = torch.zeros_like(pose)
-        around[:-1] += pull
-        around[1:] += pull
-        blocks = normal + torch.diag_embed(around)
-        if before is not None:
-            link = self._link(time_s, before, pose)
-            gradient[0] += link @ (pose[0] - before.pose)
-            blocks[0] += link
-        return gradient, blocks, -pull
+    pose, damping = start, 1e-3
+    loss, gradient, blocks = evaluate(pose)
+    for _ in range(steps):
+        damped = blocks + torch.diag_embed(damping * blocks.diagonal(dim1=1, dim2=2) + FLOOR)
+        trial = pose + solve_chain(damped, -chain.pull, -gradient)[0].clamp(-LONGEST, LONGEST)
+        new_loss, new_gradient, new_blocks = evaluate(trial)
+        if bool(new_loss < loss):
+            pose, loss, gradient, blocks = trial, new_loss, new_gradient, new_blocks
+            damping /= 10
+        else:
+            damping *= 30
+    floor = torch.full_like(pose, FLOOR)
+    _, covariance, filtered = solve_chain(blocks + floor.diag_embed(), -chain.pull, torch.zeros_like(pose))
+    # What is left of a frame's block holds the tie to the next frame, of which the frames so far know nothing.
+    return pose, covariance, filtered - torch.nn.functional.pad(chain.pull, (0, 0, 0, 1)).diag_embed()
 
 
 def solve_chain(
@@ -241,25 +294,10 @@ def _unwound(angles: Float[Tensor, "frames 3"], before: Message | None) -> Float
     return angles - turn * whole.cumsum(0)
 
 
-def _frames(observation: Observation, index: Tensor) -> Observation:
-    """Some frames of a batch of them."""
-    cloud = replace(observation.cloud, **{n: getattr(observation.cloud, n)[index] for n in observation.cloud.__dataclass_fields__})
-    return Observation(cloud, observation.potential[index], observation.nearest[index], observation.camera)
-
-
-def _take(found: Registration, index) -> Registration:
-    values = {n: getattr(found, n) for n in Registration.__dataclass_fields__}
-    bound = values.pop("bound")
-    return Registration(**{n: v[index] for n, v in values.items()}, bound=bound[:, index])
-
-
-def _put(found: Registration, index: Tensor, new: Registration) -> Registration:
-    values = {}
-    for n in Registration.__dataclass_fields__:
-        v = getattr(found, n).clone()
-        if n == "bound":
-            pass
-        else:
-            v[index] = getattr(new, n)
-        values[n] = v
-    return Registration(**values)
+def _without_gaps(
+    pose: Float[Tensor, "frames parameters"], sound: Bool[Tensor, " frames"]
+) -> Float[Tensor, "frames parameters"]:
+    """With the nearest sound frame's pose where a frame has none; zeros if no frame has one."""
+    frames = torch.arange(len(pose), device=pose.device)
+    away = (frames[:, None] - frames).abs() + len(pose) * ~sound
+    return torch.where(sound.any(), pose[away.argmin(1)], torch.zeros_like(pose))
