@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.geometry import angle_between
-from torchpose.least_squares import linearize_by_autograd
 
+DRAWS = 32  # pairs of poses for the standard deviations of the angles
 SIDES = ("left", "right")
 LIMB_ANGLE_NAMES = tuple(
     f"{joint}_{side}_limb" for joint in ("elbow", "knee", "shoulder", "hip") for side in SIDES
@@ -113,8 +113,26 @@ def angle_sd(
     pose: Float[Tensor, "batch parameters"],
     covariance: Float[Tensor, "batch parameters parameters"],
     size: Float[Tensor, "#batch sizes"],
-) -> Float[Tensor, "batch 21"]:
-    """Standard deviations of the anatomical angles from the pose's covariance, to first order, at most pi."""
-    _, jacobian = linearize_by_autograd(lambda x: anatomical_angles(body, body(x, size)))(pose)
-    variance = ((jacobian @ covariance) * jacobian).sum(-1)
-    return torch.nan_to_num(variance.clamp_min(0).sqrt(), nan=torch.pi, posinf=torch.pi).clamp_max(torch.pi)
+) -> Float[Tensor, "batch angles"]:
+    """Standard deviations of the anatomical angles about those of `pose`, rad, from the pose's covariance.
+
+    By draws from the pose's Gaussian (the same for every frame, in pairs of opposite ones), not by derivatives: the rotation
+    of a limb that is almost straight, and the flexion of an arm held out to the side, may be any within the uncertainty of
+    the limb's direction, which a derivative at one direction does not see. Differences go round the circle, so that an angle
+    of which nothing is known has pi / sqrt(3). A covariance that is not finite gives that, too.
+    """
+    even = torch.quasirandom.SobolEngine(pose.shape[1], scramble=True, seed=0).draw(DRAWS).to(pose)
+    normal = torch.special.ndtri(even.clamp(1e-4, 1 - 1e-4))
+    normal = torch.cat([normal, -normal])
+    value, axes = torch.linalg.eigh(torch.where(covariance.isfinite(), covariance, 0.0))
+    root = axes * value.clamp_min(0).sqrt()[:, None]
+    step = (normal @ root.mT).clamp(-torch.pi, torch.pi)  # (B, draws, P)
+    drawn = (pose[:, None] + step).flatten(0, 1)
+    each = size if len(size) == 1 else size.repeat_interleave(len(normal), 0)
+    angles = anatomical_angles(body, body(drawn, each)).unflatten(0, (len(pose), len(normal)))
+    gap = angles - anatomical_angles(body, body(pose, size))[:, None]
+    gap = torch.remainder(gap + torch.pi, 2 * torch.pi) - torch.pi
+    sd = (gap * gap).mean(1).sqrt()
+    nothing = torch.pi / 3**0.5
+    known = covariance.flatten(1).isfinite().all(1, keepdim=True) & pose.isfinite().all(1, keepdim=True)
+    return torch.where(known, sd, nothing).clamp_max(nothing)

@@ -194,7 +194,8 @@ class Smoother(nn.Module):
                 )
                 mine, theirs = both.score.chunk(2)
                 better = theirs < mine.nan_to_num(nan=torch.inf) - BETTER
-                now = now.put(part[better], both.take(len(part) + better.nonzero()[:, 0]))
+                # Fitted anew with that prior, a frame may have found home from its own pose, too.
+                now = now.put(part, both.take(torch.arange(len(part)).to(part) + len(part) * better))
         return now
 
     def _equations(
