@@ -1,13 +1,15 @@
 """Accuracy and speed of `infer.py` on recordings with true joints.
 
-python -m benchmarks.people ../shared/data/people [--json FILE] [--oracle STAGE ...] [--frames N] [key=value ...]
+python -m benchmarks.people ../shared/data/people [--json FILE] [--oracle STAGE ...] [--settings thesis] [--ablate]
+    [--frames N] [--only NAME] [key=value ...]
 
 Limb angles (degrees) and joints (mm) follow DESIGN.md's definitions on both sides; `within` is the share of
 the twelve limb joints within 10 cm, `unanswered` the share of frames without a pose. Errors are over the
 answered frames. Times are CPU milliseconds a frame on one thread. An oracle puts the truth in the place of one
 stage, which tells what that stage costs: `disparity` the true depth, `mask` the true silhouette, `labels` the
-true body parts, `start` the true pose before the first frame, `size` the true lengths of the limbs. Settings
-are those of infer.py.
+true body parts, `start` the true pose before the first frame, `size` the true lengths of the limbs. `--ablate` runs
+the registration with each term switched off, and the thesis's with each correction alone; frames are looked at
+once. Settings are those of infer.py.
 """
 
 import argparse
@@ -27,7 +29,7 @@ from torchpose.body.angle import limb_angles
 from torchpose.body.model import BodyModel
 from torchpose.cli import InferConfig, load_config
 from torchpose.pipeline import Eyes, FramePose, Sight, SmoothingWindow, StereoToPose
-from torchpose.recording import Frame, open_recording
+from torchpose.recording import Backgrounds, Frame, Recording, open_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
 from torchpose.vision.points import sample_grid
 
@@ -42,6 +44,43 @@ SEGMENT_OF_PART = {"head": "head", "neck": "torso", "chest": "torso", "pelvis": 
     f"{part}_{side[0].upper()}": f"{part}_{side}"
     for part in ("upper_arm", "forearm", "hand", "thigh", "shank", "foot")
     for side in ("left", "right")
+}
+
+
+_THESIS = "registration=thesis"
+_R, _T = "pose.registration", "pose.tracking"
+# Settings beside the default: the thesis, each correction alone added to it, and each term of ours switched off.
+ABLATIONS: dict[str, tuple[str, ...]] = {
+    "as it is": (),
+    "the thesis as written": (_THESIS,),
+    "thesis, no Potts and geodesic": (_THESIS, f"{_R}.labelling.potts=0", f"{_R}.labelling.geodesic=0"),
+    "thesis, sigma 0.10 to 0.03 m": (_THESIS, f"{_R}.sigma_first=0.1", f"{_R}.sigma_last=0.03"),
+    "  that, no geodesic": (_THESIS, f"{_R}.sigma_first=0.1", f"{_R}.sigma_last=0.03", f"{_R}.labelling.geodesic=0"),
+    "thesis + visible side": (_THESIS, f"{_R}.visible=true"),
+    "thesis + robust, no part": (_THESIS, f"{_R}.robust_sd=0.05", f"{_R}.outlier=3"),
+    "thesis + silhouette": (_THESIS, f"{_R}.rim.weight=1"),
+    "thesis + swings": (_THESIS, "pose.body.joint=swing"),
+    "thesis + sizes": (_THESIS, "pose.size.rounds=5"),
+    "thesis + colours": (_THESIS, "pose.colour.strength=1"),
+    "thesis + chain of frames": (_THESIS, "pose.smoothing.rounds=3"),
+    "all but colours": ("pose.colour.strength=0",),
+    "all but the chain of frames": ("pose.smoothing.rounds=0",),
+    "all but limb search": (f"{_T}.look_around=1e6", f"{_T}.stray_share=1", "pose.start.refreshes=0"),
+    "all but sizes": ("pose.size.rounds=0",),
+    "all but visible side": (f"{_R}.visible=false",),
+    "all but silhouette": (f"{_R}.rim.weight=0",),
+    "all but robust weights": (f"{_R}.robust_sd=0",),
+    "all but the label `no part`": (f"{_R}.outlier=0",),
+    "all but annealing": (f"{_R}.sigma_first=0.03",),
+    "all but sliding (tangential 1)": (f"{_R}.tangential=1",),
+    "all but Potts": (f"{_R}.labelling.potts=0",),
+    "all but face and torso": ("pose.appearance.face=0", "pose.appearance.torso=0"),
+    "all but limits": (f"{_R}.fitting.limit_sd=0",),
+    "all but the rest pose": (f"{_R}.rest_sd=0",),
+    "all but swings (hinges)": ("pose.body.joint=revolute",),
+    "all, soft labels": (f"{_R}.hard=false",),
+    "all, and geodesic": (f"{_R}.labelling.geodesic=0.04",),
+    "all, algebraic distance": (f"{_R}.distance=algebraic",),
 }
 
 
@@ -72,6 +111,23 @@ class Truth:
         if image is None:
             raise ValueError(f"the oracle needs {path}")
         return image
+
+
+class RememberingEyes(Eyes):
+    """Eyes that look at each frame once, however often the recording is run."""
+
+    def __init__(self, eyes: Eyes):
+        super().__init__(eyes.camera, eyes.config)
+        self.eyes, self.seen, self.stopwatch = eyes, dict[int, Sight](), eyes.stopwatch
+
+    def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
+        if self.eyes.background is None:
+            self.eyes.learn_background(backgrounds, recording, device)
+
+    def forward(self, frame: Frame, device: torch.device) -> Sight:
+        if frame.index not in self.seen:
+            self.seen[frame.index] = self.eyes(frame, device)
+        return self.seen[frame.index]
 
 
 class OracleEyes(Eyes):
@@ -167,11 +223,18 @@ def true_size(body: BodyModel, truth: Truth) -> Float[Tensor, "1 sizes"]:
 
 
 def measure(
-    folder: Path, config: InferConfig, oracles: Sequence[str], frames: int | None
+    folder: Path,
+    config: InferConfig,
+    oracles: Sequence[str] = (),
+    frames: int | None = None,
+    eyes: Eyes | None = None,
 ) -> dict[str, float]:
-    """Figures of one recording."""
+    """Figures of one recording. `eyes` that have looked at it before may look again."""
     recording, truth = open_recording(folder), Truth(folder)
+    torch.manual_seed(config.seed)
     model = StereoToPose(recording.camera, config.eyes, config.pose)
+    if eyes is not None:
+        model.eyes = eyes
     labels = TrueLabels(model.body.segment_names, truth)
     if set(oracles) & {"disparity", "mask"}:
         model.eyes = OracleEyes(model.eyes, truth, oracles)
@@ -220,24 +283,31 @@ def measure(
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.people", description=__doc__.split("\n")[0])
     parser.add_argument("people", type=Path, help="folder of recordings, each with a truth/ folder")
-    parser.add_argument("settings", nargs="*", help="settings of infer.py, key=value")
+    parser.add_argument("overrides", nargs="*", help="settings of infer.py, key=value")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     parser.add_argument(
         "--oracle", nargs="+", choices=ORACLES, default=[], help="stages that the truth replaces"
     )
     parser.add_argument("--frames", type=int, help="only the first frames of each recording")
+    parser.add_argument("--settings", choices=("default", "thesis"), default="default", help="of the registration")
+    parser.add_argument("--ablate", action="store_true", help="a row for each term that is switched off, or alone on")
     parser.add_argument("--only", help="only recordings whose name contains this")
     arguments = parser.parse_intermixed_args(argv)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    config = load_config("infer", arguments.settings)
+    overrides = [f"registration={arguments.settings}", *arguments.overrides]
+    config = load_config("infer", overrides)
     folders = sorted(path.parent for path in arguments.people.glob("*/truth"))
     folders = [folder for folder in folders if not arguments.only or arguments.only in folder.name]
     if not folders:
         parser.error(f"{arguments.people} must hold recordings with a truth/ folder, got none")
+    if arguments.ablate:
+        ablation = ablate(folders, arguments.overrides, arguments.frames)
+        if arguments.json:
+            arguments.json.write_text(json.dumps({"settings": arguments.overrides, "ablation": ablation}))
+        return
     table = {}
     for folder in folders:
-        torch.manual_seed(config.seed)
         table[folder.name] = measure(folder, config, arguments.oracle, arguments.frames)
         if len(table) == 1:
             print(_row("recording", {name: name for name in table[folder.name]}))
@@ -249,8 +319,30 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(_row("overall", table["overall"]))
     if arguments.json:
         arguments.json.write_text(
-            json.dumps({"settings": arguments.settings, "oracle": arguments.oracle, "table": table})
+            json.dumps({"settings": overrides, "oracle": arguments.oracle, "table": table})
         )
+
+
+def ablate(
+    folders: Sequence[Path], overrides: Sequence[str], frames: int | None
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Figures by setting and recording; every recording is looked at once. Printed as they come."""
+    table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in ABLATIONS}
+    for folder in folders:
+        recording = open_recording(folder)
+        config = load_config("infer", overrides)
+        eyes = RememberingEyes(Eyes(recording.camera, config.eyes))
+        for name, settings in ABLATIONS.items():
+            own = load_config("infer", [*settings, *overrides])
+            table[name][folder.name] = measure(folder, own, (), frames, eyes)
+    short = [folder.name.removesuffix("_m2") for folder in folders]
+    print(f"{'degrees':<34}" + " ".join(f"{name[:9]:>9}" for name in [*short, "overall", "mm", "within"]))
+    for name, rows in table.items():
+        angles = [row["angle_deg"] for row in rows.values()]
+        mean = [float(np.mean([row[key] for row in rows.values()])) for key in ("joint_mm", "within")]
+        cells = [f"{value:9.1f}" for value in [*angles, float(np.mean(angles)), mean[0]]]
+        print(f"{name:<34}" + " ".join([*cells, f"{mean[1]:9.3f}"]))
+    return table
 
 
 def _row(name: str, figures: dict) -> str:

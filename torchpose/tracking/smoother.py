@@ -19,7 +19,7 @@ from torchpose.registration.vem import Observation, Registrar, Registration, is_
 
 ANGLES = slice(3, 6)  # of the root, which come round again
 MOST = 48  # rows registered at once: more are no faster
-BETTER = 1.0  # nats by which a neighbour's pose must fit better to be taken
+BETTER = 1.0  # nats by which another pose must fit better to be taken
 LONGEST = 0.5  # m and rad, of a step in one unknown
 FLOOR = 1e-6  # precision of every unknown of every frame, so that none is without any
 
@@ -171,31 +171,35 @@ class Smoother(nn.Module):
     def _try_neighbours(
         self, observation: Observation, now: Registration, pull: Tensor, size: Tensor
     ) -> Registration:
-        """Each frame that differs from a neighbour is fitted from there, too, and keeps the better fit."""
+        """Each frame that differs from a neighbour is fitted anew, from its own pose and from there, and keeps the best.
+
+        All three poses are weighed with the same prior, that of both neighbours: with the prior of one, a frame that is
+        right would follow a neighbour that is wrong.
+        """
         T = len(now.pose)
         frames = torch.arange(T, device=now.pose.device)
+        tie = torch.nn.functional.pad(pull, (0, 0, 1, 1))
+        tie_before, tie_after = tie[:-1], tie[1:]
         for side in (-1, 1):
             pose = now.pose  # with what the first side has found
-            other = frames + side
-            inside = (other >= 0) & (other < T)
-            other = other.clamp(0, T - 1)
-            apart = (pose[other, 6:] - pose[:, 6:]).abs().amax(1) > self.config.apart
-            rows = (inside & apart).nonzero()[:, 0]
+            before, after = pose[(frames - 1).clamp_min(0)], pose[(frames + 1).clamp_max(T - 1)]
+            mean = (tie_before * before + tie_after * after) / (tie_before + tie_after)
+            other = before if side < 0 else after
+            rows = ((other[:, 6:] - pose[:, 6:]).abs().amax(1) > self.config.apart).nonzero()[:, 0]
             for part in rows.split(MOST) if len(rows) else ():
-                near = other[part]
-                # Both answers are weighed with the same prior: the neighbour on the side that is tried.
                 twice = part.repeat(2)
-                prior = PosePrior(pose[near].repeat(2, 1), pull[torch.minimum(part, near)].repeat(2, 1))
-                both = self.registrar(
-                    observation.take(twice),
-                    torch.cat([pose[part], pose[near]]),
-                    size if len(size) == 1 else size[twice],
-                    prior,
+                prior = PosePrior(mean[twice], (tie_before + tie_after)[twice])
+                sizes = size if len(size) == 1 else size[twice]
+                starts = torch.cat([pose[part], other[part]])
+                observed = observation.take(twice)
+                old = self.registrar.evaluate(
+                    observed, pose[twice], sizes, prior, now.bound[:, twice], now.status[twice]
                 )
-                mine, theirs = both.score.chunk(2)
-                better = theirs < mine.nan_to_num(nan=torch.inf) - BETTER
-                # Fitted anew with that prior, a frame may have found home from its own pose, too.
-                now = now.put(part, both.take(torch.arange(len(part)).to(part) + len(part) * better))
+                both = self.registrar(observed, starts, sizes, prior)
+                score, which = both.score.nan_to_num(nan=torch.inf).view(2, -1).min(0)
+                better = score < old.score[: len(part)].nan_to_num(nan=torch.inf) - BETTER
+                chosen = torch.arange(len(part)).to(part) + len(part) * which
+                now = now.put(part[better], both.take(chosen[better]))
         return now
 
     def _equations(
