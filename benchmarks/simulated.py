@@ -2,7 +2,7 @@
 
 python -m benchmarks.simulated [--draws N] [--frames N] [--only MOTION] [--json FILE] [key=value ...]
 
-People of super-quadrics (not the spheroids that are fitted), each recording with a person of its own, lengths and
+People of super-quadrics (not the ellipsoids that are fitted), each recording with a person of its own, lengths and
 girths about +-10 %, stand 3 to 4 m (further, where raised hands would leave the image) before a camera of 640 x 480,
 f 800 px, 0.12 m, 20 Hz. Their disparity gets the errors of `torchpose.synthesis.depth.MatcherNoise`, their silhouette a
 ragged rim; a face is found where it is seen. No images and no matching: the eyes are replaced, and everything behind
@@ -113,9 +113,8 @@ def place(
 ) -> Float[Tensor, "time parameters"]:
     """The performance moved, as a whole, to where the camera sees all of it: 3 to 4 m away, or as far as need be."""
     posed = body(pose, size)
-    across, along = posed.radii.unbind(-1)
-    # The box about each spheroid; super-quadrics reach a little further.
-    half = (posed.frames * torch.stack((across, across, along), -1)[:, :, None]).norm(dim=-1) + 0.03
+    # The box about each ellipsoid; super-quadrics reach a little further.
+    half = (posed.frames * posed.radii[:, :, None]).norm(dim=-1) + 0.03
     low, high = posed.centers - half, posed.centers + half
     middle = (low.amin((0, 1)) + high.amax((0, 1)))[:2] / 2
     reach = torch.maximum(high[..., :2] - middle, middle - low[..., :2])

@@ -1,6 +1,6 @@
-"""What a camera would see of a posed body: surface points on a grid of pixels, by casting rays at spheroids.
+"""What a camera would see of a posed body: surface points on a grid of pixels, by casting rays at ellipsoids.
 
-Nothing of torchpose's own distances, sampling or rendering is used, only where the spheroids are.
+Nothing of torchpose's own distances, sampling or rendering is used, only where the ellipsoids are.
 """
 
 from dataclasses import dataclass, replace
@@ -63,10 +63,9 @@ def cast(
 ) -> tuple[Float[Tensor, " rays"], Int[Tensor, " rays"]]:
     """How far along each ray from the camera the body is, in rays, inf where it is missed, and which part.
 
-    In the frame of a spheroid scaled to the unit ball, |o + t d|^2 = 1 is a quadratic equation.
+    In the frame of an ellipsoid scaled to the unit ball, |o + t d|^2 = 1 is a quadratic equation.
     """
-    a, c = posed.radii[0].unbind(-1)
-    extent = torch.stack([a, a, c], -1)[:, None]
+    extent = posed.radii[0][:, None]
     start = -(posed.centers[0][:, None] @ posed.frames[0]) / extent
     d = (rays @ posed.frames[0]) / extent  # (K, rays, 3)
     dd, sd, ss = (d * d).sum(-1), (start * d).sum(-1), (start * start).sum(-1) - 1

@@ -1,6 +1,8 @@
-"""Distances to spheroids against minimisation by SciPy, dense search and the homogeneous form."""
+"""Distances to ellipsoids against minimisation by SciPy, dense search and the homogeneous form."""
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -21,14 +23,14 @@ from torchpose.body.ellipsoid import (
     to_camera,
     to_local,
 )
-from torchpose.body.model import PosedBody, spheroid_matrix
+from torchpose.body.model import PosedBody, ellipsoid_matrix
 from torchpose.geometry import exp_rotation
 
 F64 = torch.float64
 
 
-def spheroids(centers: Tensor, turns: Tensor, radii: Tensor) -> PosedBody:
-    """A posed "body" of nothing but spheroids: centres (K, 3), rotation vectors (K, 3), radii (K, 2)."""
+def ellipsoids(centers: Tensor, turns: Tensor, radii: Tensor) -> PosedBody:
+    """A posed "body" of nothing but ellipsoids: centres (K, 3), rotation vectors (K, 3), radii (K, 3)."""
     none = torch.zeros(1, 0, 3, dtype=centers.dtype)
     return PosedBody(
         torch.zeros(1, 0, 3, 3, dtype=centers.dtype),
@@ -43,95 +45,119 @@ def spheroids(centers: Tensor, turns: Tensor, radii: Tensor) -> PosedBody:
 
 
 def scene(num: int, dtype: torch.dtype = F64) -> PosedBody:
-    """Spheroids of all slants, 2 to 4 m from the camera, of a body's sizes."""
+    """Ellipsoids of all slants, flat and round ones, 2 to 4 m from the camera, of a body's sizes."""
     g = torch.Generator().manual_seed(1)
     centers = torch.randn(num, 3, generator=g, dtype=F64) * 0.5 + torch.tensor([0.0, 0.0, 3.0], dtype=F64)
     a = 0.03 + 0.13 * torch.rand(num, 1, generator=g, dtype=F64)
-    radii = torch.cat([a, a * (1 + 4 * torch.rand(num, 1, generator=g, dtype=F64))], 1)
+    b = a * (0.5 + torch.rand(num, 1, generator=g, dtype=F64))
+    c = torch.maximum(a, b) * (1 + 4 * torch.rand(num, 1, generator=g, dtype=F64))
+    b[::3] = a[::3]  # spheroids among them
+    radii = torch.cat([a, b, c], 1)
     turns = torch.randn(num, 3, generator=g, dtype=F64)
-    return spheroids(*(x.to(dtype) for x in (centers, turns, radii)))
+    return ellipsoids(*(x.to(dtype) for x in (centers, turns, radii)))
 
 
 def around(posed: PosedBody, num: int, reach: float = 2.0) -> Tensor:
-    """Points inside and around the spheroids of a scene, camera's frame."""
-    radii = posed.radii[..., [0, 0, 1]]
+    """Points inside and around the ellipsoids of a scene, camera's frame."""
+    radii = posed.radii
     local = torch.randn(*radii.shape[:2], num, 3, dtype=radii.dtype) * radii[:, :, None] * reach / 2
     return to_camera(posed, local).flatten(1, 2)
 
 
-def distance_by_bisection(r0: float, z0: float, a: float, c: float) -> float:
-    """Distance of (r0, z0) to the ellipse u^2/a^2 + v^2/c^2 = 1, r0 and z0 >= 0, in double precision.
+def distance_by_bisection(point: Sequence[float], radii: Sequence[float]) -> float:
+    """Distance of a point to the ellipsoid of these half axes, in double precision.
 
-    Eberly's method: the root of F(s) = (a r0 / s)^2 + (c z0 / (s + c^2 - a^2))^2 - 1, where s is the distance from the
-    last pole, by bisection. On the long axis, where that pole is none, the closed form.
+    Eberly's method: the root of F(s) = |r x / (s + r^2 - m^2)|^2 - 1, where m is the shortest half axis and s the
+    distance from the last pole, by bisection on a logarithmic scale. If there is none, because the point lies in the
+    plane across the shortest axis, that axis takes what the others leave.
     """
-    if r0 == 0:
-        turning = c - a * a / c  # the evolute's cusp: nearer to the centre the side is nearer than the pole
-        if z0 >= turning:
-            return abs(z0 - c)
-        v = z0 / (1 - (a / c) ** 2) if a < c else 0.0
-        return math.hypot(a * math.sqrt(max(0.0, 1 - (v / c) ** 2)), z0 - v)
-    beyond = (c - a) * (c + a)
+    x, r = np.abs(np.array(point, dtype=float)), np.array(radii, dtype=float)
+    least = r.argmin()
+    beyond = (r - r[least]) * (r + r[least])
+    low, high = 1e-150, float(np.linalg.norm(r * x)) * (1 + 1e-15) + 1e-140
 
     def F(s: float) -> float:
-        return (a * r0 / s) ** 2 + (c * z0 / (s + beyond)) ** 2 - 1
+        return float((r * x / (s + beyond)) @ (r * x / (s + beyond))) - 1
 
-    low, high = a * r0, math.hypot(a * r0, c * z0) * (1 + 1e-15)
-    for _ in range(120):
-        middle = (low + high) / 2
-        low, high = (middle, high) if F(middle) > 0 else (low, middle)
-    u, v = a * a * r0 / low, c * c * z0 / (low + beyond)
-    return math.hypot(r0 - u, z0 - v)
+    if F(low) > 0:
+        for _ in range(200):
+            middle = math.sqrt(low * high) if low * 4 < high else (low + high) / 2
+            low, high = (middle, high) if F(middle) > 0 else (low, middle)
+    foot = r * r * x / (low + beyond)
+    share = (foot / r) ** 2
+    foot[least] = r[least] * math.sqrt(max(0.0, 1 - (share.sum() - share[least])))
+    return float(np.linalg.norm(x - foot))
 
 
-def distance_by_search(r0: float, z0: float, a: float, c: float) -> float:
-    """The same by minimising over the ellipse's parameter from the best of a dense grid."""
+def distance_by_search(point: Sequence[float], radii: Sequence[float]) -> float:
+    """The same by minimising over the ellipsoid's two angles from the best of a dense grid."""
+    x, r = np.abs(np.array(point)), np.array(radii)
 
-    def distance(t: float) -> float:
-        return math.hypot(a * math.cos(t) - r0, c * math.sin(t) - z0)
+    def foot(angles: np.ndarray) -> np.ndarray:
+        t, u = angles
+        return (r * np.array([np.sin(t) * np.cos(u), np.sin(t) * np.sin(u), np.cos(t)]).T).T
 
-    grid = np.linspace(0, math.pi / 2, 2001)
-    best = grid[np.argmin(np.hypot(a * np.cos(grid) - r0, c * np.sin(grid) - z0))]
-    step = grid[1]
-    found = scipy.optimize.minimize_scalar(
-        distance, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-12}
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(0, math.pi / 2, 181)], indexing="ij")).reshape(2, -1)
+    start = grid[:, np.linalg.norm(foot(grid) - x[:, None], axis=0).argmin()]
+    found = scipy.optimize.minimize(
+        lambda angles: float(((foot(angles) - x) ** 2).sum()), start, method="Nelder-Mead",
+        options={"xatol": 1e-12, "fatol": 1e-26, "maxiter": 4000},
     )
-    return min(found.fun, distance(best))
+    return math.sqrt(found.fun)
 
 
-def nearest(point: Tensor, a: float, c: float) -> Tensor:
-    """`nearest_point` of one point and one spheroid."""
-    radii = torch.tensor([[[a, c]]], dtype=point.dtype)
-    return nearest_point(point[None, None, None], radii)[0, 0, 0]
+def nearest(point: Tensor, *radii: float) -> Tensor:
+    """`nearest_point` of one point and one ellipsoid."""
+    return nearest_point(point[None, None, None], torch.tensor([[radii]], dtype=point.dtype))[0, 0, 0]
 
 
 # Named by where the point lies; radii in metres.
-HARD = {
-    "centre": ((0.0, 0.0, 0.0), 0.1, 0.3),
-    "centre of a ball": ((0.0, 0.0, 0.0), 0.2, 0.2),
-    "centre of a needle": ((0.0, 0.0, 0.0), 0.001, 0.4),
-    "long axis, inside, side is nearest": ((0.0, 0.0, 0.1), 0.1, 0.3),
-    "long axis, inside, pole is nearest": ((0.0, 0.0, 0.29), 0.1, 0.3),
-    "long axis, at the evolute's cusp": ((0.0, 0.0, 0.3 - 0.1**2 / 0.3), 0.1, 0.3),
-    "long axis, on the pole": ((0.0, 0.0, -0.3), 0.1, 0.3),
-    "long axis, outside": ((0.0, 0.0, -0.9), 0.1, 0.3),
-    "just off the axis": ((1e-9, -1e-9, 0.1), 0.1, 0.3),
-    "off the axis by single precision's last digit": ((0.0, 1e-7, -0.2), 0.1, 0.3),
-    "near the axis, inside": ((1e-4, 0.0, 0.25), 0.1, 0.3),
-    "equator plane, inside": ((0.03, -0.04, 0.0), 0.1, 0.3),
-    "equator plane, on the surface": ((0.06, 0.08, 0.0), 0.1, 0.3),
-    "equator plane, outside": ((0.3, 0.4, 0.0), 0.1, 0.3),
-    "just off the equator plane": ((0.03, 0.04, 1e-9), 0.1, 0.3),
-    "on the surface": ((0.06, 0.0, 0.24), 0.1, 0.3),
-    "far outside": ((30.0, -40.0, 70.0), 0.1, 0.3),
-    "needle, outside": ((0.02, 0.01, 0.1), 0.001, 0.4),
-    "needle, at its tip": ((0.0005, 0.0, 0.3999), 0.001, 0.4),
-    "needle, inside": ((0.0003, 0.0, -0.2), 0.001, 0.4),
-    "ball, inside": ((0.05, 0.1, -0.02), 0.2, 0.2),
-    "ball, outside": ((0.5, 0.1, -0.2), 0.2, 0.2),
-    "almost a ball": ((1e-6, 0.0, 2e-6), 0.2, 0.2000001),
+HARD: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "centre": ((0.0, 0.0, 0.0), (0.1, 0.1, 0.3)),
+    "centre of a ball": ((0.0, 0.0, 0.0), (0.2, 0.2, 0.2)),
+    "centre of a needle": ((0.0, 0.0, 0.0), (0.001, 0.001, 0.4)),
+    "long axis, inside, side is nearest": ((0.0, 0.0, 0.1), (0.1, 0.1, 0.3)),
+    "long axis, inside, pole is nearest": ((0.0, 0.0, 0.29), (0.1, 0.1, 0.3)),
+    "long axis, at the evolute's cusp": ((0.0, 0.0, 0.3 - 0.1**2 / 0.3), (0.1, 0.1, 0.3)),
+    "long axis, on the pole": ((0.0, 0.0, -0.3), (0.1, 0.1, 0.3)),
+    "long axis, outside": ((0.0, 0.0, -0.9), (0.1, 0.1, 0.3)),
+    "just off the axis": ((1e-9, -1e-9, 0.1), (0.1, 0.1, 0.3)),
+    "off the axis by single precision's last digit": ((0.0, 1e-7, -0.2), (0.1, 0.1, 0.3)),
+    "near the axis, inside": ((1e-4, 0.0, 0.25), (0.1, 0.1, 0.3)),
+    "equator plane, inside": ((0.03, -0.04, 0.0), (0.1, 0.1, 0.3)),
+    "equator plane, on the surface": ((0.06, 0.08, 0.0), (0.1, 0.1, 0.3)),
+    "equator plane, outside": ((0.3, 0.4, 0.0), (0.1, 0.1, 0.3)),
+    "just off the equator plane": ((0.03, 0.04, 1e-9), (0.1, 0.1, 0.3)),
+    "on the surface": ((0.06, 0.0, 0.24), (0.1, 0.1, 0.3)),
+    "far outside": ((30.0, -40.0, 70.0), (0.1, 0.1, 0.3)),
+    "needle, outside": ((0.02, 0.01, 0.1), (0.001, 0.001, 0.4)),
+    "needle, at its tip": ((0.0005, 0.0, 0.3999), (0.001, 0.001, 0.4)),
+    "needle, inside": ((0.0003, 0.0, -0.2), (0.001, 0.001, 0.4)),
+    "ball, inside": ((0.05, 0.1, -0.02), (0.2, 0.2, 0.2)),
+    "ball, outside": ((0.5, 0.1, -0.2), (0.2, 0.2, 0.2)),
+    "almost a ball": ((1e-6, 0.0, 2e-6), (0.2, 0.2, 0.2000001)),
+    "flat, centre": ((0.0, 0.0, 0.0), (0.2, 0.1, 0.4)),
+    "flat, on the long axis": ((0.0, 0.0, 0.2), (0.2, 0.1, 0.4)),
+    "flat, on the middle axis": ((0.1, 0.0, 0.0), (0.2, 0.1, 0.4)),
+    "flat, on the middle axis, end is nearest": ((0.19, 0.0, 0.0), (0.2, 0.1, 0.4)),
+    "flat, on the short axis": ((0.0, -0.06, 0.0), (0.2, 0.1, 0.4)),
+    "flat, on the short axis, outside": ((0.0, -0.6, 0.0), (0.2, 0.1, 0.4)),
+    "flat, across the short axis": ((0.05, 0.0, 0.2), (0.2, 0.1, 0.4)),
+    "flat, across the short axis, near the rim": ((0.1, 0.0, 0.33), (0.2, 0.1, 0.4)),
+    "flat, across the short axis, outside": ((0.3, 0.0, 0.4), (0.2, 0.1, 0.4)),
+    "flat, just off the plane across the short axis": ((0.05, 1e-9, 0.2), (0.2, 0.1, 0.4)),
+    "flat, across the middle axis": ((0.0, 0.03, 0.2), (0.2, 0.1, 0.4)),
+    "flat, across the long axis": ((0.05, 0.03, 0.0), (0.2, 0.1, 0.4)),
+    "flat, at the cusp of the long axis": ((0.0, 0.0, 0.4 - 0.1**2 / 0.4), (0.2, 0.1, 0.4)),
+    "flat, far outside": ((30.0, -40.0, 70.0), (0.2, 0.1, 0.4)),
+    "disc, inside": ((0.1, 0.0005, 0.2), (0.4, 0.001, 0.4)),
+    "disc, at its rim": ((0.2399, 0.0, 0.3199), (0.4, 0.001, 0.4)),
+    "blade, inside": ((0.03, 0.0002, 0.3), (0.05, 0.001, 0.4)),
+    "almost round": ((1e-6, 0.03, 0.29), (0.1, 0.1000001, 0.3)),
+    "nearly round, beyond the first cusp": ((-1.7e-6, -0.007, 0.993 * 3), (0.1, 0.10001, 3.0)),
 }
 radius = st.floats(0.01, 0.3)
+ratios = st.one_of(st.floats(1, 3), st.floats(-7, 0).map(lambda digits: 1 + 10**digits), st.just(1.0))
 coordinate = st.one_of(st.floats(-3, 3), st.floats(-1e-6, 1e-6), st.just(0.0))
 
 
@@ -139,50 +165,56 @@ class TestNearestPoint:
     @pytest.mark.parametrize("name", HARD)
     def test_the_oracles_agree(self, name: str) -> None:
         """Bisection and minimisation know nothing of each other."""
-        (x, y, z), a, c = HARD[name]
-        args = (math.hypot(x, y), abs(z), a, c)
-        assert distance_by_bisection(*args) == pytest.approx(distance_by_search(*args), abs=1e-9)
+        assert distance_by_bisection(*HARD[name]) == pytest.approx(distance_by_search(*HARD[name]), abs=1e-9)
 
     @pytest.mark.parametrize("dtype", [torch.float32, F64], ids=["single", "double"])
     @pytest.mark.parametrize("name", HARD)
     def test_hard_cases(self, name: str, dtype: torch.dtype) -> None:
-        point, a, c = HARD[name]
-        self.assert_nearest(torch.tensor(point, dtype=dtype), a, c)
+        point, radii = HARD[name]
+        self.assert_nearest(torch.tensor(point, dtype=dtype), *radii)
 
     @given(coordinate, coordinate, coordinate, radius, st.floats(1, 30))
     def test_any_spheroid_and_point(self, x: float, y: float, z: float, a: float, ratio: float) -> None:
         for dtype in (torch.float32, F64):
-            self.assert_nearest(torch.tensor([x, y, z], dtype=dtype), a, a * ratio)
+            self.assert_nearest(torch.tensor([x, y, z], dtype=dtype), a, a, a * ratio)
 
-    @given(st.floats(-9, 0), st.floats(-3e-2, 3e-2), radius, st.floats(1.01, 30))
-    def test_near_the_cusp(self, exponent: float, off: float, a: float, ratio: float) -> None:
-        """About the end of the medial axis iterations converge worst (8 plain Newton steps left 5e-5 m)."""
-        c = a * ratio
+    @given(coordinate, coordinate, coordinate, radius, ratios, ratios, st.booleans())
+    def test_any_ellipsoid_and_point(
+        self, x: float, y: float, z: float, a: float, flat: float, long: float, turned: bool
+    ) -> None:
+        across = (a * flat, a) if turned else (a, a * flat)
+        for dtype in (torch.float32, F64):
+            self.assert_nearest(torch.tensor([x, y, z], dtype=dtype), *across, a * flat * long)
+
+    @given(st.floats(-9, 0), st.floats(-3e-2, 3e-2), radius, ratios, st.floats(1.01, 30))
+    def test_near_the_cusp(self, exponent: float, off: float, a: float, flat: float, ratio: float) -> None:
+        """About the end of the medial surface iterations converge worst (8 plain Newton steps left 5e-5 m)."""
+        c = a * flat * ratio
         point = torch.tensor(
             [0.6 * a * 10**exponent, -0.8 * a * 10**exponent, (c - a * a / c) * (1 + off)], dtype=F64
         )
-        self.assert_nearest(point, a, c)
-        self.assert_nearest(point.float(), a, c)
+        self.assert_nearest(point, a, a * flat, c)
+        self.assert_nearest(point.float(), a, a * flat, c)
 
     @staticmethod
-    def assert_nearest(point: Tensor, a: float, c: float) -> None:
-        foot = nearest(point, a, c)
+    def assert_nearest(point: Tensor, *radii: float) -> None:
+        foot = nearest(point, *radii)
         # The oracle gets the numbers that single precision has made of them.
-        a, c = (torch.tensor(r, dtype=point.dtype).double().item() for r in (a, c))
-        x, y, z = point.double().tolist()
-        expected = distance_by_bisection(math.hypot(x, y), abs(z), a, c)
+        exact = torch.tensor(radii, dtype=point.dtype).double()
+        expected = distance_by_bisection(point.tolist(), exact.tolist())
         # METHOD's 1e-6 m, plus the half unit of the last digit that a coordinate of many metres has.
-        size = float(point.abs().max()) + c
+        size = float(point.abs().max()) + max(radii)
         rounding = size * torch.finfo(point.dtype).eps
         atol = (1e-6 if point.dtype == torch.float32 else 1e-12) + rounding
         assert (point.double() - foot.double()).norm().item() == pytest.approx(expected, abs=atol)
-        u, v, w = foot.double().tolist()
         # On the surface: along the normal that is off by the form's error over its slope.
-        form = math.hypot(u / a, v / a, w / c) - 1
-        assert abs(form) * a < atol
+        form = float((foot.double() / exact).norm()) - 1
+        assert abs(form) * min(radii) < atol
 
     def test_many_at_once_equal_one_by_one(self) -> None:
-        radii = torch.tensor([[[0.1, 0.3], [0.05, 0.05]], [[0.2, 0.25], [0.01, 0.4]]], dtype=F64)
+        radii = torch.tensor(
+            [[[0.1, 0.2, 0.3], [0.05, 0.05, 0.05]], [[0.2, 0.15, 0.25], [0.01, 0.01, 0.4]]], dtype=F64
+        )
         points = torch.randn(2, 2, 7, 3, dtype=F64) * 0.3
         feet = nearest_point(points, radii)
         for b in range(2):
@@ -194,34 +226,46 @@ class TestNearestPoint:
     def test_turns_and_flips_with_the_point(self) -> None:
         """A spheroid looks the same turned about its axis and from its other end."""
         point = torch.tensor([0.05, 0.02, 0.17], dtype=F64)
-        foot = nearest(point, 0.1, 0.3)
+        foot = nearest(point, 0.1, 0.1, 0.3)
         turn = exp_rotation(torch.tensor([0.0, 0.0, 2.1], dtype=F64))
         flip = torch.tensor([1.0, 1.0, -1.0], dtype=F64)
-        assert_close(nearest(turn @ point, 0.1, 0.3), turn @ foot, atol=1e-14, rtol=0)
-        assert_close(nearest(flip * point, 0.1, 0.3), flip * foot, atol=1e-14, rtol=0)
+        assert_close(nearest(turn @ point, 0.1, 0.1, 0.3), turn @ foot, atol=1e-14, rtol=0)
+        assert_close(nearest(flip * point, 0.1, 0.1, 0.3), flip * foot, atol=1e-14, rtol=0)
 
+    def test_mirrored_and_with_its_axes_renamed(self) -> None:
+        """An ellipsoid is its own mirror image in three planes; the order of its axes means nothing."""
+        point, radii = torch.tensor([0.05, -0.02, 0.17], dtype=F64), (0.2, 0.1, 0.3)
+        foot = nearest(point, *radii)
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            flip = torch.tensor(signs, dtype=F64)
+            assert_close(nearest(flip * point, *radii), flip * foot, atol=1e-15, rtol=0)
+        for order in itertools.permutations(range(3)):
+            renamed = nearest(point[list(order)], *(radii[i] for i in order))
+            assert_close(renamed, foot[list(order)], atol=1e-15, rtol=0)
+
+    @pytest.mark.parametrize("radii", [(0.1, 0.1, 0.3), (0.1, 0.15, 0.3), (0.15, 0.1, 0.3)])
     @pytest.mark.parametrize(
         "point",
         [(0.3, -0.1, 0.4), (0.02, 0.03, 0.1), (0.0601, 0.0, 0.24), (0.3, 0.2, 0.0), (0.02, 0.05, 0.0)],
         ids=["outside", "inside", "near the surface", "equator plane outside", "equator plane inside"],
     )
-    def test_gradients(self, point: tuple[float, float, float]) -> None:
+    def test_gradients(self, point: tuple[float, ...], radii: tuple[float, ...]) -> None:
         inputs = (
             torch.tensor([[[point]]], dtype=F64, requires_grad=True),
-            torch.tensor([[[0.1, 0.3]]], dtype=F64, requires_grad=True),
+            torch.tensor([[radii]], dtype=F64, requires_grad=True),
         )
         assert torch.autograd.gradcheck(nearest_point, inputs, atol=1e-6)
         # The gradient of the distance is the unit vector from the foot, which autograd does not know.
-        local, radii = inputs
-        (gap := (local - nearest_point(local, radii))).norm().backward()
+        local, half_axes = inputs
+        (gap := (local - nearest_point(local, half_axes))).norm().backward()
         assert local.grad is not None
         assert_close(local.grad, (gap / gap.norm()).detach(), atol=1e-7, rtol=0)
 
     @pytest.mark.parametrize("name", HARD)
     def test_gradients_are_finite_everywhere(self, name: str) -> None:
-        point, a, c = HARD[name]
+        point, half_axes = HARD[name]
         local = torch.tensor([[[point]]], dtype=F64, requires_grad=True)
-        radii = torch.tensor([[[a, c]]], dtype=F64, requires_grad=True)
+        radii = torch.tensor([[half_axes]], dtype=F64, requires_grad=True)
         nearest_point(local, radii).sum().backward()
         assert local.grad is not None
         assert radii.grad is not None
@@ -232,7 +276,7 @@ class TestNearestPoint:
 class TestSurfaceNormal:
     def test_is_unit_outward_and_square_to_the_surface(self) -> None:
         posed = scene(6)
-        extent = posed.radii[..., [0, 0, 1]][:, :, None]
+        extent = posed.radii[:, :, None]
         ball = torch.nn.functional.normalize(torch.randn(1, 6, 50, 3, dtype=F64), dim=-1)
         point = ball * extent
         normal = surface_normal(point, posed.radii)
@@ -291,7 +335,7 @@ class TestFootPoint:
         assert (facing > -1e-7).all()
         assert_close(facing[foot.hidden], torch.zeros_like(facing[foot.hidden]), atol=1e-7, rtol=0)
         # On the surface, all of them; and on the visible side nothing has changed.
-        form = (foot.local / posed.radii[..., [0, 0, 1]][:, :, None]).norm(dim=-1)
+        form = (foot.local / posed.radii[:, :, None]).norm(dim=-1)
         assert_close(form, torch.ones_like(form), atol=1e-12, rtol=0)
         assert_close(foot.local[~foot.hidden], plain.local[~foot.hidden], atol=0, rtol=0)
         assert (foot.distance >= plain.distance - 1e-12).all()
@@ -304,7 +348,7 @@ class TestFootPoint:
         height, turn = 1 - 2 * n / 40_000, n * math.pi * (3 - 5**0.5)
         level = (1 - height**2).sqrt()
         ball = torch.stack([level * turn.cos(), level * turn.sin(), height], -1)
-        surface = to_camera(posed, ball * posed.radii[..., [0, 0, 1]][:, :, None])
+        surface = to_camera(posed, ball * posed.radii[:, :, None])
         normal = surface_normal(to_local_each(posed, surface), posed.radii)
         normal = (posed.frames[:, :, None] @ normal[..., None])[..., 0]
         seen = (surface * normal).sum(-1) < 0
@@ -318,7 +362,7 @@ class TestFootPoint:
             assert (foot.distance[0, k] <= expected + 1e-9).all()
 
     def test_distance_is_continuous_across_the_rim(self) -> None:
-        """Along lines through spheroids of every slant the distance changes by no more than the way walked.
+        """Along lines through ellipsoids of every slant the distance changes by no more than the way walked.
 
         (Turning the hidden points to the near side of the rim's plane made it jump by up to 5 cm.)
         """
@@ -348,10 +392,10 @@ class TestFootPoint:
         assert_close((gap * tangent).sum(-1), torch.zeros(len(gap), dtype=F64), atol=2e-3, rtol=0)
 
     def test_camera_inside_sees_no_rim(self) -> None:
-        posed = spheroids(
+        posed = ellipsoids(
             torch.tensor([[0.01, 0.0, 0.02]], dtype=F64),
             torch.zeros(1, 3, dtype=F64),
-            torch.tensor([[0.1, 0.3]], dtype=F64),
+            torch.tensor([[0.1, 0.1, 0.3]], dtype=F64),
         )
         foot = foot_point(posed, torch.randn(1, 20, 3, dtype=F64))
         assert not foot.hidden.any()
@@ -359,10 +403,10 @@ class TestFootPoint:
 
     def test_camera_on_the_long_axis(self) -> None:
         """The rim is then a circle, whose axes are arbitrary."""
-        posed = spheroids(
+        posed = ellipsoids(
             torch.tensor([[0.0, 0.0, 3.0]], dtype=F64),
             torch.zeros(1, 3, dtype=F64),
-            torch.tensor([[0.1, 0.3]], dtype=F64),
+            torch.tensor([[0.1, 0.1, 0.3]], dtype=F64),
         )
         # C = 10 half lengths away: the rim is at 1/10 of them, sqrt(1 - 1/100) wide.
         point = torch.tensor([[[0.0, 0.2, 3.2]]], dtype=F64)
@@ -416,7 +460,7 @@ def repeat(posed: PosedBody, times: int) -> PosedBody:
 
 
 def to_local_each(posed: PosedBody, points: Tensor) -> Tensor:
-    """Points (B, K, N, 3) of the camera's frame, each spheroid's own, in its frame."""
+    """Points (B, K, N, 3) of the camera's frame, each ellipsoid's own, in its frame."""
     return (points - posed.centers[:, :, None]) @ posed.frames
 
 
@@ -426,7 +470,7 @@ class TestAlgebraicDistance:
         posed = scene(5)
         points = around(posed, 10, reach=4.0)
         X = torch.cat([points, torch.ones_like(points[..., :1])], -1)[:, None]
-        q = (X @ spheroid_matrix(posed) * X).sum(-1) - 2
+        q = (X @ ellipsoid_matrix(posed) * X).sum(-1) - 2
         assert_close(algebraic_distance(posed, points), q, atol=1e-9, rtol=1e-9)
 
     def test_sign_and_surface(self) -> None:
@@ -444,7 +488,7 @@ class TestOutline:
         posed = scene(20)
         rim = outline(posed, 16)
         assert rim.shape == (1, 20, 16, 3)
-        A = spheroid_matrix(posed)
+        A = ellipsoid_matrix(posed)
         X = torch.cat([rim, torch.ones_like(rim[..., :1])], -1)
         form = (X @ A * X).sum(-1)
         assert_close(form, torch.full_like(form, 2.0), atol=1e-10, rtol=0)
@@ -454,7 +498,7 @@ class TestOutline:
         assert_close(slope, torch.zeros_like(slope), atol=1e-12, rtol=0)
 
     def test_goes_all_the_way_round(self) -> None:
-        """The rim's image has the spheroid's centre inside: the points' bearings about it cover the circle."""
+        """The rim's image has the ellipsoid's centre inside: the points' bearings about it cover the circle."""
         posed = scene(20)
         rim, center = (x[..., :2] / x[..., 2:] for x in (outline(posed, 32), posed.centers))
         spokes = rim - center[:, :, None]
@@ -466,7 +510,7 @@ class TestOutline:
         base = scene(2)
 
         def rim(centers: Tensor, radii: Tensor) -> Tensor:
-            return outline(spheroids(centers, torch.full((2, 3), 0.4, dtype=F64), radii), 5)
+            return outline(ellipsoids(centers, torch.full((2, 3), 0.4, dtype=F64), radii), 5)
 
         inputs = (base.centers[0].clone().requires_grad_(), base.radii[0].clone().requires_grad_())
         assert torch.autograd.gradcheck(rim, inputs, atol=1e-6)

@@ -21,11 +21,10 @@ def body():
 
 
 def surface(body, pose, size):
-    """Points of the body's skin: of every spheroid those that lie in no other one, with their parts."""
+    """Points of the body's skin: of every ellipsoid those that lie in no other one, with their parts."""
     posed = body(pose, size)
     ball = torch.nn.functional.normalize(torch.randn(14, PER_PART, 3, dtype=torch.float64), dim=-1)
-    a, c = posed.radii[0].unbind(-1)
-    extent = torch.stack([a, a, c], -1)
+    extent = posed.radii[0]
     points = (ball * extent[:, None]) @ posed.frames[0].mT + posed.centers[0][:, None]
     part = torch.arange(14)[:, None].expand(-1, PER_PART).flatten()
     points = points.flatten(0, 1)

@@ -11,7 +11,7 @@ import yaml
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchpose.body.model import BodyConfig, BodyModel, JointKind, PosedBody, spheroid_matrix
+from torchpose.body.model import BodyConfig, BodyModel, JointKind, PosedBody, ellipsoid_matrix
 from torchpose.body.skeleton import HUMAN
 from torchpose.geometry import exp_rotation, hat
 
@@ -59,10 +59,9 @@ def tensors(posed: PosedBody) -> dict[str, Tensor]:
 
 
 def on_surface(posed: PosedBody, num: int) -> tuple[Tensor, Tensor]:
-    """Random points of every spheroid: in its frame and in the camera's."""
+    """Random points of every ellipsoid: in its frame and in the camera's."""
     ball = torch.nn.functional.normalize(torch.randn(1, posed.radii.shape[1], num, 3, dtype=F64), dim=-1)
-    a, c = posed.radii.unbind(-1)
-    local = ball * torch.stack([a, a, c], -1)[:, :, None]
+    local = ball * posed.radii[:, :, None]
     return local, local @ posed.frames.mT + posed.centers[:, :, None]
 
 
@@ -126,8 +125,8 @@ class TestForward:
         foot = posed.centers[0, revolute.segment_names.index("foot_left")]
         assert foot[2] < joint["ankle_left"][2] < 3.05
         # From the crown to the soles it is as tall as the file says, within the hair and the shoes.
-        R, reach = posed.frames[0], posed.radii[0][:, [0, 0, 1]]
-        extent = ((R[:, 1] * reach) ** 2).sum(-1).sqrt()  # half height of each spheroid
+        R, reach = posed.frames[0], posed.radii[0]
+        extent = ((R[:, 1] * reach) ** 2).sum(-1).sqrt()  # half height of each ellipsoid
         tall = (posed.centers[0, :, 1] + extent).max() - (posed.centers[0, :, 1] - extent).min()
         assert tall.item() == pytest.approx(revolute.height, abs=0.1)
 
@@ -167,7 +166,7 @@ class TestForward:
         axes = torch.tensor([segment.axis for segment in body.skeleton.segments], dtype=F64)
         expected = (posed.rotations[:, list(body.segment_bodies)] @ axes[:, :, None])[..., 0]
         assert_close(posed.frames[..., 2], expected, atol=1e-12, rtol=0)
-        assert (posed.radii[..., 0] <= posed.radii[..., 1]).all()
+        assert (posed.radii[..., :2] <= posed.radii[..., 2:]).all()
 
     def test_batch_equals_one_by_one(self, body: BodyModel) -> None:
         pose, size = random_pose(body, 4), random_size(body, 4)
@@ -375,11 +374,11 @@ class TestMirror:
         assert_close(two.rotations, flipped, atol=1e-12, rtol=0)
 
 
-class TestSpheroidMatrix:
+class TestEllipsoidMatrix:
     def test_is_two_on_the_surface(self, body: BodyModel) -> None:
         posed = body(random_pose(body, 3), random_size(body, 3))
         local, _ = on_surface(posed, 20)
-        A = spheroid_matrix(posed)
+        A = ellipsoid_matrix(posed)
         for scale, value in (
             (1.0, 2.0),
             (0.0, 1.0),

@@ -59,7 +59,7 @@ def test_every_motion_is_possible_continuous_on_the_floor_and_in_view(motion, pe
     assert fine.joints.diff(dim=0).norm(dim=-1).max() * 100 < 8  # m/s; a jump would be far above
     soles = lowest(BODY, posed)
     assert (soles.amax(1) - MotionConfig().floor).abs().max() < 0.005
-    feet_and_hands = posed.centers + posed.radii[..., 1:] * posed.frames[..., 2]
+    feet_and_hands = posed.centers + posed.radii[..., 2:] * posed.frames[..., 2]
     pixels = CAMERA.project(torch.cat((posed.joints, feet_and_hands), 1))
     assert (pixels >= 0).all()
     assert (pixels <= torch.tensor([639, 479])).all()
@@ -167,7 +167,7 @@ def test_a_tall_person_stands_further_off():
     size = draw_person(0).size(BODY)
     pose = perform(BODY, size, "both_hands", torch.arange(40) / 20, CAMERA, config=config)
     tips = BODY(pose, size)
-    hands = tips.centers + tips.radii[..., 1:] * tips.frames[..., 2]
+    hands = tips.centers + tips.radii[..., 2:] * tips.frames[..., 2]
     assert pose[:, 2].min() > 2.0  # 1.2 m would cut off feet and hands
     assert (CAMERA.project(hands)[..., 1] >= 0).all()
     assert near[:, 2].min() > 2.4

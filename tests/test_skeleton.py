@@ -98,7 +98,7 @@ class TestHuman:
         assert origin["forearm_left"][1] > 0
         assert origin["shank_left"][1] > 0
         for segment in human.segments:
-            assert 0 < segment.radius[1] <= segment.half_length[1] < human.height / 2
+            assert 0 < min(segment.radius[1]) <= max(segment.radius[1]) <= segment.half_length[1] < human.height / 2
 
     def test_axes_and_directions_are_unit_vectors(self, human: Skeleton) -> None:
         for body in human.bodies:

@@ -76,7 +76,7 @@ class Overlay:
     """What to draw over one image; what is None, or has a NaN, is not drawn."""
 
     status: str
-    outlines: Float[Tensor, "parts rim 2"] | None = None  # px, the spheroids' silhouettes as polygons
+    outlines: Float[Tensor, "parts rim 2"] | None = None  # px, the ellipsoids' silhouettes as polygons
     joints: Float[Tensor, "15 2"] | None = None  # px, in the order of `JOINT_NAMES`
     points: Float[Tensor, "num 2"] | None = None  # px
     labels: Int[Tensor, " num"] | None = None  # the part of each point; anything but 0 to 13 is none

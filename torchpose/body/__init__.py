@@ -1,1 +1,1 @@
-"""The body: a kinematic tree from a readable file, spheroids and super-quadrics on it, angles out of it."""
+"""The body: a kinematic tree from a readable file, ellipsoids and super-quadrics on it, angles out of it."""

@@ -1,4 +1,4 @@
-"""The articulated body: pose and sizes in; rigid bodies, spheroids and joints in the camera's frame out.
+"""The articulated body: pose and sizes in; rigid bodies, ellipsoids and joints in the camera's frame out.
 
 Left-camera frame (x right, y down, z forward); metres and radians. A pose has P = 24 parameters: the root's
 translation, its yaw, pitch and roll, then two per joint. A body's own frame is x to its left, y down, z out
@@ -36,9 +36,9 @@ class PosedBody:
 
     rotations: Float[Tensor, "batch bodies 3 3"]  # R_camera_body
     origins: Float[Tensor, "batch bodies 3"]  # m, of the rigid bodies: the joint to the parent
-    centers: Float[Tensor, "batch parts 3"]  # m, of the spheroids
-    frames: Float[Tensor, "batch parts 3 3"]  # columns: the spheroids' axes, the long one last
-    radii: Float[Tensor, "batch parts 2"]  # m: across the long axis, and along it
+    centers: Float[Tensor, "batch parts 3"]  # m, of the ellipsoids
+    frames: Float[Tensor, "batch parts 3 3"]  # columns: the ellipsoids' axes, the long one last
+    radii: Float[Tensor, "batch parts 3"]  # m: half axes along the columns of `frames`
     joints: Float[Tensor, "batch joints 3"]  # m, in the order of `BodyModel.joint_names`
     # Axis of each parameter: a unit vector, but shorter the further a swing has turned (see `left_jacobian`).
     screw_axes: Float[Tensor, "batch parameters 3"]
@@ -61,15 +61,15 @@ class BodyModel(nn.Module):
     limbs: Tensor  # (J, 3) direction of each limb in its own body
     centers: Tensor  # (J, 3) direction of each limb at zero, in the parent body
     align: Tensor  # (J, 3, 3) brings `limbs` to `centers`: the body's rotation at zero
-    # (S, 3 J + 3 K + 3 joints + 2 K): sizes times it are offsets in the parents' frames, centres and joints in
+    # (S, 3 J + 3 K + 3 joints + 3 K): sizes times it are offsets in the parents' frames, centres and joints in
     # their bodies', and radii.
     size_basis: Tensor
-    segment_frames: Tensor  # (K, 3, 3) columns: the spheroid's axes in its body
+    segment_frames: Tensor  # (K, 3, 3) columns: the ellipsoid's axes in its body
     bottom: Tensor  # (6,) the last row of a body's place in its parent
     by_depth: Tensor  # (J,) the bodies but for the root, by their depth in the tree
     above: Tensor  # (J,) where among root and `by_depth` the parent of each of these is
     places: Tensor  # (bodies,) where among them each body is
-    carriers: Tensor  # (K + joints,) the body that carries each spheroid and joint
+    carriers: Tensor  # (K + joints,) the body that carries each ellipsoid and joint
 
     def __init__(self, config: BodyConfig = BodyConfig()):
         super().__init__()
@@ -166,10 +166,11 @@ class BodyModel(nn.Module):
             return table
 
         skeleton = self.skeleton
-        radii = torch.zeros(len(skeleton.segments), 2, len(self.size_names))
+        radii = torch.zeros(len(skeleton.segments), 3, len(self.size_names))
         for row, segment in enumerate(skeleton.segments):
-            for column, (name, value) in enumerate((segment.radius, segment.half_length)):
-                radii[row, column, self.size_names.index(name)] = value
+            (girth, across), (length, along) = segment.radius, segment.half_length
+            radii[row, :2, self.size_names.index(girth)] = torch.tensor(across)
+            radii[row, 2, self.size_names.index(length)] = along
         tables = [
             basis([body.origin for body in skeleton.bodies]),
             basis([segment.center for segment in skeleton.segments]),
@@ -179,9 +180,8 @@ class BodyModel(nn.Module):
         self.size_counts = [len(table.flatten(0, 1)) for table in tables]
         self._constant("bottom", torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
         self._constant("size_basis", torch.cat([table.flatten(0, 1) for table in tables]).mT)
-        long_axis = torch.tensor([segment.axis for segment in skeleton.segments])
-        up = torch.tensor([0.0, 0.0, 1.0]).expand_as(long_axis)
-        self._constant("segment_frames", exp_rotation(rotation_between(up.double(), long_axis.double())))
+        axes = torch.tensor([segment.axis for segment in skeleton.segments], dtype=torch.double)
+        self._constant("segment_frames", frame_along(axes))
 
     def default_size(self, batch: int) -> Float[Tensor, "batch sizes"]:
         return torch.ones(batch, len(self.size_names), dtype=self.axes.dtype, device=self.axes.device)
@@ -204,7 +204,7 @@ class BodyModel(nn.Module):
             size = self.default_size(1)
         shift, center, joint, radii = (
             x.unflatten(1, (-1, n)).expand(B, -1, -1)
-            for x, n in zip((size @ self.size_basis).split(self.size_counts, 1), (3, 3, 3, 2), strict=True)
+            for x, n in zip((size @ self.size_basis).split(self.size_counts, 1), (3, 3, 3, 3), strict=True)
         )
         root, root_axes, local, axes = self._turns(pose)
         # Each body as (R, t, axes of its joint), 3 x 6: the parent's (R, t) times (local; 0 0 0 1 0 0) places it.
@@ -223,14 +223,13 @@ class BodyModel(nn.Module):
         turns = carriers[..., :3]
         points = (turns @ torch.cat([center, joint], 1)[..., None])[..., 0] + carriers[..., 3]
         centers, joints = points.split([self.num_parts, len(self.joint_bodies)], 1)
-        # A stout person's segment may grow as thick as it is long, but a spheroid's long axis stays the long one.
-        across, along = radii.unbind(-1)
+        # A stout person's segment may grow as thick as it is long, but an ellipsoid's long axis stays the long one.
         return PosedBody(
             R,
             t,
             centers,
             turns[:, : self.num_parts] @ self.segment_frames,
-            torch.stack([across, torch.maximum(across, along)], -1),
+            torch.cat([radii[..., :2], radii.amax(-1, keepdim=True)], -1),
             joints,
             torch.cat([root_axes, placed[:, 1:, :, 4:].mT.flatten(1, 2)], 1),
             torch.cat([pose[:, None, :3].expand(B, 6, 3), t[:, 1:].repeat_interleave(2, 1)], 1),
@@ -262,7 +261,7 @@ class BodyModel(nn.Module):
     def jacobian(
         self, posed: PosedBody, points: Float[Tensor, "batch parts num 3"]
     ) -> Float[Tensor, "batch parts num 3 parameters"]:
-        """Derivative of points fixed to the spheroids: `axis x (p - origin)`, 0 off the path (App. E)."""
+        """Derivative of points fixed to the ellipsoids: `axis x (p - origin)`, 0 off the path (App. E)."""
         lever = points[..., None, :] - posed.screw_origins[:, None, None]
         turning = torch.linalg.cross(posed.screw_axes[:, None, None].expand_as(lever), lever)
         columns = torch.cat(
@@ -272,7 +271,7 @@ class BodyModel(nn.Module):
 
     @property
     def part_moves(self) -> Bool[Tensor, "parts parameters"]:
-        """Which parameters move which spheroid."""
+        """Which parameters move which ellipsoid."""
         return self.moves.index_select(0, self.carriers[: self.num_parts])
 
     def pose_from_directions(
@@ -326,10 +325,20 @@ def _turned(rotation: Tensor, column: Tensor) -> Tensor:
     return (rotation @ column)[..., 0]
 
 
-def spheroid_matrix(posed: PosedBody) -> Float[Tensor, "batch parts 4 4"]:
+def frame_along(axis: Float[Tensor, "*axes 3"]) -> Float[Tensor, "*axes 3 3"]:
+    """R_body_part: the third column along the unit vector `axis`, the first the body's x as far as it lies across.
+
+    Of an axis along x itself the first column is the body's y.
+    """
+    eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    across = torch.where(axis[..., :1].abs() > 0.9, eye[1], eye[0])
+    first = nn.functional.normalize(across - axis * (across * axis).sum(-1, keepdim=True), dim=-1)
+    return torch.stack([first, torch.linalg.cross(axis, first), axis], -1)
+
+
+def ellipsoid_matrix(posed: PosedBody) -> Float[Tensor, "batch parts 4 4"]:
     """The homogeneous form A with `X^T A X = 2` on the surface (T. 3.3), in the camera's frame."""
-    a, c = posed.radii.unbind(-1)
-    D = torch.diag_embed(torch.stack([a, a, c], -1) ** -2)
+    D = torch.diag_embed(posed.radii**-2)
     A = posed.frames @ D @ posed.frames.mT
     b = -(A @ posed.centers[..., None])
     corner = (posed.centers[..., None, :] @ -b) + 1

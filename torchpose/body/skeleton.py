@@ -1,4 +1,4 @@
-"""The body file: a kinematic tree with sizes, limits, spheroids and reported joints, as plain checked data.
+"""The body file: a kinematic tree with sizes, limits, ellipsoids and reported joints, as plain checked data.
 
 Metres and radians; `human.yaml` is written in metres and degrees. Every vector is given per size (`trunk`,
 `thigh`, ...), so that the whole geometry is linear in the sizes of a person.
@@ -62,13 +62,16 @@ class Body:
 
 @dataclass(frozen=True)
 class Segment:
-    """A spheroid on a body: centre, direction of its long axis, radius across it and half its length."""
+    """An ellipsoid on a body: centre, direction of its long axis, half axes across it and half its length.
+
+    Of the two across, the first is the body's x as far as it lies across (its y, if the long axis is x).
+    """
 
     name: str
     body: int
     center: SizedVector
     axis: Vector
-    radius: tuple[str, float]
+    radius: tuple[str, tuple[float, float]]
     half_length: tuple[str, float]
 
 
@@ -176,11 +179,24 @@ def _expand(data: Any) -> Skeleton:
             raise ValueError(f"a vector must be given per length, of {data['lengths']}, got {entry}")
         return SizedVector(tuple((name, _vector(value)) for name, value in entry.items()))
 
-    def measure(entry: Any, kind: str) -> tuple[str, float]:
-        name, value = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else ("", 0)
-        if name not in data[kind] or not 0 < float(value) < inf:
+    def measure(entry: Any, kind: str) -> tuple[str, tuple[float, ...]]:
+        name, given = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else ("", 0)
+        values = tuple(float(value) for value in (given if isinstance(given, list) else [given]))
+        if name not in data[kind] or not values or not all(0 < value < inf for value in values):
             raise ValueError(f"one of {data[kind]} must come with a positive value in metres, got {entry}")
-        return name, float(value)
+        return name, values
+
+    def across(entry: Any) -> tuple[str, tuple[float, float]]:
+        name, values = measure(entry, "girths")
+        if len(values) > 2:
+            raise ValueError(f"radius must be one number or two, across the long axis, got {entry}")
+        return name, (values[0], values[-1])
+
+    def along(entry: Any) -> tuple[str, float]:
+        name, values = measure(entry, "lengths")
+        if len(values) > 1:
+            raise ValueError(f"half_length must be one number, got {entry}")
+        return name, values[0]
 
     height = float(data["height"])
     if not 0 < height < inf:
@@ -225,10 +241,10 @@ def _expand(data: Any) -> Skeleton:
     segments, joints = [], []
     for name, entry in data["segments"].items():
         with _reading(f"segment {name}"):
-            radius, half_length = measure(entry["radius"], "girths"), measure(entry["half_length"], "lengths")
-            if radius[1] > half_length[1]:
+            radius, half_length = across(entry["radius"]), along(entry["half_length"])
+            if max(radius[1]) > half_length[1]:
                 raise ValueError(
-                    f"half_length must be at least the radius (a <= c), got {half_length} < {radius}"
+                    f"half_length must be at least the radius, got {half_length} < {radius}"
                 )
             for body in sides(entry):
                 side, center, axis = (

@@ -21,7 +21,7 @@ import yaml
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.model import BodyModel, PosedBody
+from torchpose.body.model import BodyModel, PosedBody, frame_along
 
 EXPONENTS = (2, 4, 6)
 PERSON = Path(__file__).with_name("person.yaml")
@@ -402,7 +402,7 @@ class DisplayModel(nn.Module):
         self._constant("segments", torch.tensor(segments))
         self._constant("materials", torch.tensor([part.cloth for part in parts]))
         self._constant("cuts", torch.tensor([part.cut(person) for part in parts]))
-        self._constant("frames", torch.stack([_frame(torch.tensor(part.axis)) for part in parts]))
+        self._constant("frames", frame_along(torch.tensor([part.axis for part in parts])))
         self._constant("offsets", torch.tensor([part.start for part in parts]) * lengths[:, None])
         head = torch.tensor([size["head_girth"], size["neck"], size["head_girth"]])
         self._constant(
@@ -421,10 +421,3 @@ class DisplayModel(nn.Module):
         rotations = posed.rotations[:, self.bodies]
         origins = posed.origins[:, self.bodies] + (rotations @ self.offsets.to(rotations)[..., None])[..., 0]
         return PosedParts(rotations @ self.frames.to(rotations), origins)
-
-
-def _frame(axis: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """R_body_part: z along the axis, x the body's x (its y, if that is the axis) as far as it lies across."""
-    across = torch.eye(3)[1 if axis[0].abs() > 0.9 else 0]
-    x = nn.functional.normalize(across - axis * (across @ axis), dim=0)
-    return torch.stack((x, torch.linalg.cross(axis, x), axis), -1)

@@ -20,7 +20,7 @@ from torchpose.vision.points import Cells, shortest_paths
 RINGS, SPOKES = (
     16,
     12,
-)  # points all over a spheroid; the farthest of them is within 2 % of the farthest of all
+)  # points all over an ellipsoid; the farthest of them is within 2 % of the farthest of all
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,12 @@ def geodesic_bounds(
     detour = between @ girth  # (K, K)
     near, far = _reaches(body, posed)
     ways = _ways(body, posed)
-    width = posed.radii[0, :, 0]
+    width = posed.radii[0, :, :2].amax(-1)
     around = (pi - 2) * (width[:, None] + width)
     apart = between.any(-1)
     shortest = torch.where(apart, _over_joints(near, ways) - 2 * detour - margin, 0.0).clamp_min(0)
     farthest = torch.where(apart, _over_joints(far, ways), _extents(posed))
-    area = posed.radii[0].prod(-1)
+    area = width * posed.radii[0, :, 2]
     return GeodesicBounds(shortest, stretch * farthest + pi * detour + around + margin, area / area.sum())
 
 
@@ -86,7 +86,7 @@ def _joint_girths(body: BodyModel, posed: PosedBody) -> Float[Tensor, " joints"]
     """Radius of the body at each joint, m: that of the thickest part below it."""
     on_body = torch.tensor(body.segment_bodies, device=posed.radii.device)
     child = torch.arange(1, len(body.parents) + 1, device=posed.radii.device)
-    return torch.where(on_body == child[:, None], posed.radii[0, :, 0], 0.0).amax(1)
+    return torch.where(on_body == child[:, None], posed.radii[0, :, :2].amax(-1), 0.0).amax(1)
 
 
 def _at_joints(body: BodyModel) -> Bool[Tensor, "bodies joints"]:
@@ -110,8 +110,7 @@ def _reaches(
 ) -> tuple[Float[Tensor, "parts joints"], Float[Tensor, "parts joints"]]:
     """Least and greatest distance (m) of each part from the joints of its rigid body; inf from others."""
     local = (posed.origins[:, None, 1:] - posed.centers[:, :, None]) @ posed.frames  # (1, K, J, 3)
-    a, c = posed.radii.unbind(-1)
-    inside = (local / torch.stack([a, a, c], -1)[:, :, None]).norm(dim=-1) < 1
+    inside = (local / posed.radii[:, :, None]).norm(dim=-1) < 1
     near = torch.where(inside, 0.0, (local - nearest_point(local, posed.radii)).norm(dim=-1))
     far = (local[:, :, None] - _surface(posed)[:, :, :, None]).norm(dim=-1).amax(2)
     on_body = _at_joints(body)[list(body.segment_bodies)]
@@ -119,13 +118,12 @@ def _reaches(
 
 
 def _surface(posed: PosedBody) -> Float[Tensor, "1 parts points 3"]:
-    """Points all over each spheroid, in its own frame, m."""
+    """Points all over each ellipsoid, in its own frame, m."""
     polar = torch.linspace(0, pi, RINGS + 1).to(posed.radii)[:, None]
     turn = torch.arange(SPOKES).to(posed.radii) * (2 * pi / SPOKES)
     x, y = polar.sin() * turn.cos(), polar.sin() * turn.sin()
     ball = torch.stack([x, y, polar.cos().expand_as(x)], -1)
-    a, c = posed.radii.unbind(-1)
-    return ball.flatten(0, 1) * torch.stack([a, a, c], -1)[:, :, None]
+    return ball.flatten(0, 1) * posed.radii[:, :, None]
 
 
 def _extents(posed: PosedBody) -> Float[Tensor, "parts parts"]:

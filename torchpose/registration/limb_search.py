@@ -102,11 +102,11 @@ class LimbSearch(nn.Module):
 
 
 def _only(posed: PosedBody, parts: Int[Tensor, "batch own"]) -> PosedBody:
-    """A posed body with these spheroids alone."""
+    """A posed body with these ellipsoids alone."""
     index = parts[..., None]
     return replace(
         posed,
         centers=posed.centers.gather(1, index.expand(-1, -1, 3)),
         frames=posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3)),
-        radii=posed.radii.gather(1, index.expand(-1, -1, 2)),
+        radii=posed.radii.gather(1, index.expand(-1, -1, 3)),
     )

@@ -137,7 +137,7 @@ class _JointProblem:
     rows: Rows
     prior: PosePrior
     posed: (
-        PosedBody  # where the rows were made: a foot point keeps its place relative to the spheroid's radii
+        PosedBody  # where the rows were made: a foot point keeps its place relative to the ellipsoid's radii
     )
     mean: Tensor
     root: Tensor
@@ -167,16 +167,11 @@ class _JointProblem:
         return torch.cat([residual.reshape(1, -1), prior], 1), torch.cat([both, own])[None]
 
     def _resized(self, posed: PosedBody) -> Rows:
-        """The rows with their model points where the spheroids' new radii put them."""
-        grown = _extent(posed) / _extent(self.posed)
+        """The rows with their model points where the ellipsoids' new radii put them."""
+        grown = posed.radii / self.posed.radii
         local = self.rows.local * grown.gather(1, self.rows.part[..., None].expand(-1, -1, 3))
         return Rows(self.rows.part, local, self.rows.target, self.rows.direction)
 
     def _row_residual(self, posed: PosedBody) -> Tensor:
         rows = self._resized(posed)
         return (rows.direction * (rows.target - rows.points(posed))).sum(-1)
-
-
-def _extent(posed: PosedBody) -> Float[Tensor, "batch parts 3"]:
-    a, c = posed.radii.unbind(-1)
-    return torch.stack([a, a, c], -1)

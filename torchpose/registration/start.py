@@ -186,7 +186,7 @@ def pelvis_position(
     """A first guess of the middle of the hips, m: below the face, or below the head's top over the cloud's middle."""
     posed = body(torch.zeros(1, body.num_parameters).to(size), size[:1])
     down = -posed.centers[0, body.segment_names.index("head"), 1]  # hips below the head's centre, upright
-    crown = posed.radii[0, body.segment_names.index("head"), 1]
+    crown = posed.radii[0, body.segment_names.index("head"), 2]
     nan = torch.nan
     points = torch.where(cloud.mask[..., None], cloud.points, nan)
     middle = points.nanmedian(1).values

@@ -449,11 +449,10 @@ def _stand(
 
 
 def lowest(body: BodyModel, posed: PosedBody) -> Float[Tensor, "batch 2"]:
-    """Height (y, m) of the lowest point of the left and right foot's spheroid: the sole."""
+    """Height (y, m) of the lowest point of the left and right foot's ellipsoid: the sole."""
     feet = [body.segment_names.index(name) for name in ("foot_left", "foot_right")]
-    across, along = posed.radii[:, feet].unbind(-1)
-    down = posed.frames[:, feet, 1]  # the spheroid's axes, as far as they point down
-    return posed.centers[:, feet, 1] + (down * torch.stack((across, across, along), -1)).norm(dim=-1)
+    down = posed.frames[:, feet, 1]  # the ellipsoid's axes, as far as they point down
+    return posed.centers[:, feet, 1] + (down * posed.radii[:, feet]).norm(dim=-1)
 
 
 def _joints(body: BodyModel, posed: PosedBody, name: str) -> Float[Tensor, "batch 2 3"]:
@@ -471,7 +470,7 @@ def _distances(
     zero = size.new_zeros(1, 3)
     posed = body(body.pose_from_directions(zero, zero, limbs), size)
     hand = body.segment_names.index("hand_left")
-    tip = (posed.centers[0, hand, 1] - posed.radii[0, hand, 1]).item()
+    tip = (posed.centers[0, hand, 1] - posed.radii[0, hand, 2]).item()
     above = (lowest(body, posed).amax().item() - tip) - config.floor
     room_above, room_below = (camera.cy + 0.5) * 0.98, (camera.height - camera.cy - 0.5) * 0.98
     fits = max(
