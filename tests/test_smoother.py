@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
 from torchpose.least_squares import Status
-from torchpose.registration.fitting import PosePrior
+from torchpose.registration.fitting import FittingConfig, PosePrior
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.vem import Registrar, Registration, RegistrationConfig
 from torchpose.tracking.smoother import (
@@ -209,11 +209,10 @@ def test_stretches_that_hear_of_coming_frames_are_near_the_whole():
         head, covariance, filtered = fitted(precision[:16], mean[:16], replace(chain, pull=chain.pull[:15]))
         tail, later, _ = fitted(precision[10:], mean[10:], message_chain(chain, 9, head, filtered))
         sd = whole_covariance.diagonal(dim1=1, dim2=2).sqrt()
-        print("STRETCH", *(float(((a-b).abs()/c).max()) for a,b,c in ((head[:10],whole[:10],sd[:10]),(tail,whole[10:],sd[10:]),(tail[4:],whole[14:],sd[14:]))), float(((covariance[:10]-whole_covariance[:10])/whole_covariance[:10].diagonal(dim1=1,dim2=2).amin(1)[:,None,None]).abs().max()))
         # What the first stretch does not see is more than six frames off.
-        assert ((head[:10] - whole[:10]).abs() / sd[:10]).max() < 0.5
-        assert ((tail - whole[10:]).abs() / sd[10:]).max() < 0.7
-        assert ((tail[4:] - whole[14:]).abs() / sd[14:]).max() < 0.1
+        assert ((head[:10] - whole[:10]).abs() / sd[:10]).max() < 0.15
+        assert ((tail - whole[10:]).abs() / sd[10:]).max() < 0.35
+        assert ((tail[4:] - whole[14:]).abs() / sd[14:]).max() < 0.05
         # Covariances depend on no mean, and the message's precision has heard of no coming frame: exact.
         assert_close(later, whole_covariance[10:], rtol=0, atol=1e-5)
         assert_close(covariance[:10], whole_covariance[:10], rtol=0.05, atol=1e-4)
@@ -225,7 +224,9 @@ def test_a_frame_that_is_not_finite_says_nothing():
     spoiled[2] = torch.nan
     silent = precision.clone()
     silent[2] = 0
-    for got, want in zip(fitted(precision, spoiled, chain, mean * 0), fitted(silent, mean, chain), strict=True):
+    for got, want in zip(
+        fitted(precision, spoiled, chain, mean * 0), fitted(silent, mean, chain), strict=True
+    ):
         assert_close(got, want)
 
 
@@ -294,7 +295,11 @@ def scene(body):
 
 
 def arm(body):
-    return [i for i, name in enumerate(body.parameter_names) if name.startswith(("upper_arm_left", "forearm_left"))]
+    return [
+        i
+        for i, name in enumerate(body.parameter_names)
+        if name.startswith(("upper_arm_left", "forearm_left"))
+    ]
 
 
 def miss(body, found, pose):
@@ -319,8 +324,8 @@ def test_a_limb_lost_in_one_frame_is_recovered_from_a_neighbour(body, scene):
     assert miss(body, kept, pose)[2] > miss(body, smooth, pose)[2]
 
 
-def test_a_better_neighbour_on_the_second_side_is_weighed_against_the_first(body, scene):
-    """Right and nearly right neighbours of a wrong frame: the later of both does not undo the better."""
+def test_a_frame_that_is_right_does_not_follow_a_neighbour_that_is_wrong(body, scene):
+    """A wrong frame between a right neighbour and a wrong one, on either side: what one shows the other does not undo."""
     pose, observation, registrar, found = scene
     names = arm(body)
     lost = found.pose.clone()
@@ -329,7 +334,9 @@ def test_a_better_neighbour_on_the_second_side_is_weighed_against_the_first(body
         start = lost.clone()
         start[neighbour, names] = walk(body, 1, [2.2])[0, names]
         nothing = PosePrior(start, start * 0)
-        rated = registrar.evaluate(observation, start, body.default_size(1), nothing, found.bound, found.status)
+        rated = registrar.evaluate(
+            observation, start, body.default_size(1), nothing, found.bound, found.status
+        )
         smoother = Smoother(body, registrar, SmoothingConfig(sweeps=1, rounds=0))
         smooth = smoother(observation, times(6), rated, body.default_size(1)).registration
         assert miss(body, smooth, pose)[2] < 0.04, neighbour
@@ -444,12 +451,14 @@ def test_no_rounds_leave_the_poses_and_tell_nothing(body, scene):
     assert not smooth.filtered.any()
 
 
-def test_the_truth_lies_within_two_sd(body):
+@pytest.mark.parametrize("labelled", [True, False])
+def test_the_truth_lies_within_two_sd(body, labelled):
     """Random poses of a chain, points of known noise: of 24 parameters in all frames 90 to 99 % within 2 sd.
 
-    The equations are those of points on surfaces, so labels, feet and Gauss-Newton are all in the error.
+    With the true labels told 95.7 % are; with labels found at a sigma near the noise 92.9 %. At a sigma of 2 cm it is
+    60 % (noise 2 mm): beside the joints labels are wrong by more than the noise.
     """
-    noise, T, config = 0.004, 4, SmoothingConfig(rounds=6, joint_drift=0.3, root_drift=0.2)
+    noise, T, config = 0.002, 4, SmoothingConfig(sweeps=0, rounds=6, joint_drift=0.3, root_drift=0.2)
     registrar = Registrar(
         body,
         RegistrationConfig(
@@ -460,24 +469,31 @@ def test_the_truth_lies_within_two_sd(body):
             effective_points=1e6,
             rim=RimConfig(weight=0.0),
             sigma_first=0.03,
-            sigma_last=0.02,
+            sigma_last=3 * noise,
+            fitting=FittingConfig(limit_sd=0.0),
         ),
     )
     rate = torch.full((24,), config.joint_drift)
     rate[:6] = config.root_drift
-    generator, inside, count = torch.Generator().manual_seed(1), 0, 0
+    generator, off = torch.Generator().manual_seed(1), []
     for _ in range(6):
         steps = torch.randn(T - 1, 24, generator=generator) * rate * math.sqrt(DT)
         pose = standing(body) + torch.cat([torch.zeros(1, 24), steps.cumsum(0)])
-        views = [see(body, row[None], num=300, noise=noise, generator=generator) for row in pose]
+        views = [see(body, row[None], num=300) for row in pose]
         observation = together(views)
+        # `see` moves points along rays alone; the rows assume noise in all directions.
+        shape = observation.cloud.points.shape
+        points = observation.cloud.points + noise * torch.randn(shape, generator=generator)
+        observation = replace(observation, cloud=replace(observation.cloud, points=points))
+        if labelled:
+            part = torch.cat([view.part for view in views]).clamp_min(0)
+            told = torch.full_like(observation.potential, -100.0).scatter(2, part[..., None], 0.0)
+            observation = replace(observation, potential=told)
         found = registrar(observation, pose + 0.01, body.default_size(1))
         smooth = Smoother(body, registrar, config)(observation, times(T), found, body.default_size(1))
         sd = smooth.registration.covariance.diagonal(dim1=1, dim2=2).sqrt()
-        off = (smooth.registration.pose - pose).abs() / sd
-        inside, count = inside + int((off < 2).sum()), count + off.numel()
-    print("CALIB", inside / count)
-    assert 0.90 < inside / count < 0.99
+        off.append((smooth.registration.pose - pose) / sd)
+    assert 0.90 < (torch.cat(off).abs() < 2).float().mean() < 0.99
 
 
 def test_taken_rows_are_the_frames_one_by_one_and_put_back(body, scene):
@@ -526,5 +542,3 @@ def test_bad_times_are_told(body, scene, time_s):
         Smoother(body, registrar)(
             observation, torch.tensor(time_s, dtype=torch.float64), found, body.default_size(1)
         )
-
-

@@ -180,24 +180,31 @@ class Smoother(nn.Module):
         frames = torch.arange(T, device=now.pose.device)
         tie = torch.nn.functional.pad(pull, (0, 0, 1, 1))
         tie_before, tie_after = tie[:-1], tie[1:]
+        precision, sizes = tie_before + tie_after, size.expand(T, -1)
         for side in (-1, 1):
             pose = now.pose  # with what the first side has found
             before, after = pose[(frames - 1).clamp_min(0)], pose[(frames + 1).clamp_max(T - 1)]
-            mean = (tie_before * before + tie_after * after) / (tie_before + tie_after)
+            mean = (tie_before * before + tie_after * after) / precision
             other = before if side < 0 else after
             rows = ((other[:, 6:] - pose[:, 6:]).abs().amax(1) > self.config.apart).nonzero()[:, 0]
             for part in rows.split(MOST) if len(rows) else ():
                 twice = part.repeat(2)
-                prior = PosePrior(mean[twice], (tie_before + tie_after)[twice])
-                sizes = size if len(size) == 1 else size[twice]
-                starts = torch.cat([pose[part], other[part]])
-                observed = observation.take(twice)
                 old = self.registrar.evaluate(
-                    observed, pose[twice], sizes, prior, now.bound[:, twice], now.status[twice]
+                    observation.take(part),
+                    pose[part],
+                    sizes[part],
+                    PosePrior(mean[part], precision[part]),
+                    now.bound[:, part],
+                    now.status[part],
                 )
-                both = self.registrar(observed, starts, sizes, prior)
+                both = self.registrar(
+                    observation.take(twice),
+                    torch.cat([pose[part], other[part]]),
+                    sizes[twice],
+                    PosePrior(mean[twice], precision[twice]),
+                )
                 score, which = both.score.nan_to_num(nan=torch.inf).view(2, -1).min(0)
-                better = score < old.score[: len(part)].nan_to_num(nan=torch.inf) - BETTER
+                better = score < old.score.nan_to_num(nan=torch.inf) - BETTER
                 chosen = torch.arange(len(part)).to(part) + len(part) * which
                 now = now.put(part[better], both.take(chosen[better]))
         return now
