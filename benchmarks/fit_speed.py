@@ -131,12 +131,11 @@ def random_poses(
 def cast(
     body: BodyModel, pose: Float[Tensor, "batch parameters"]
 ) -> tuple[Float[Tensor, "batch height width"], Int[Tensor, "batch height width"]]:
-    """Depth (m, NaN beside the body) and part of every pixel: with a spheroid as the unit ball, |o + t d| = 1."""
+    """Depth (m, NaN beside the body) and part of every pixel: with an ellipsoid as the unit ball, |o + t d| = 1."""
     posed = body(pose)
     v, u = torch.meshgrid(torch.arange(CAMERA.height), torch.arange(CAMERA.width), indexing="ij")
     rays = CAMERA.back_project(torch.stack([u, v], -1).flatten(0, 1).float(), torch.ones(u.numel()))
-    a, c = posed.radii.unbind(-1)
-    extent = torch.stack([a, a, c], -1)[:, :, None]
+    extent = posed.radii[:, :, None]
     origin = -(posed.centers[:, :, None] @ posed.frames) / extent
     way = (rays @ posed.frames) / extent
     dd, od, oo = (way * way).sum(-1), (origin * way).sum(-1), (origin * origin).sum(-1) - 1
@@ -306,8 +305,8 @@ class Problem:
             posed = self.body(pose, size)
             frames = posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3))
             centers = posed.centers.gather(1, index.expand(-1, -1, 3))
-            radii = posed.radii.gather(1, index.expand(-1, -1, 2))
-            # Every point has a spheroid of its own.
+            radii = posed.radii.gather(1, index.expand(-1, -1, 3))
+            # Every point has an ellipsoid of its own.
             foot = nearest_point((frames.mT @ (self.points - centers)[..., None]).mT, radii)
             normal = (frames @ surface_normal(foot, radii).mT)[..., 0]
             rows = Rows(self.part, foot[:, :, 0], self.points, normal / SD)

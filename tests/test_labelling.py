@@ -135,6 +135,19 @@ def test_without_colours_it_can_fall():
     assert (mean_field(potential, near, mask, coloured, grid, history=True).bound.diff(dim=0) >= -1e-9).all()
 
 
+@pytest.mark.parametrize("sweeps", [0, 1, 3])
+@pytest.mark.parametrize("potts", [0.0, 0.5])
+def test_the_bound_is_the_last_of_the_history_and_that_of_the_beliefs(sweeps, potts):
+    potential, near, mask, _ = random_case()
+    config = LabellingConfig(sweeps=sweeps, potts=potts)
+    alone, all_of_them = (mean_field(potential, near, mask, config, history=h) for h in (False, True))
+    assert alone.bound.shape == (1, 1)
+    assert all_of_them.bound.shape == (sweeps + 1, 1)
+    assert torch.equal(alone.belief, all_of_them.belief)
+    assert torch.equal(alone.bound[-1], all_of_them.bound[-1])
+    assert_close(alone.bound[-1], label_bound(potential, alone.belief, near, potts))
+
+
 def test_points_of_one_colour_are_never_neighbours():
     grid, mask, near = random_grid(100, rows=10, columns=10, padding=0)
     colour = (grid[0, :, 0] + 2 * grid[0, :, 1]) % COLOURS

@@ -165,9 +165,7 @@ class PoseEquations:
     def __call__(self, pose: Float[Tensor, "batch parameters"]) -> tuple[Tensor, Tensor, Tensor]:
         return self.at(pose, self.body(pose, self.size))
 
-    def at(
-        self, pose: Float[Tensor, "batch parameters"], posed: PosedBody
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def at(self, pose: Float[Tensor, "batch parameters"], posed: PosedBody) -> tuple[Tensor, Tensor, Tensor]:
         """The same with the body `posed` at this pose, if it is at hand."""
         residual, slope = pose_terms(self.body, pose, self.prior, self.config)
         # Each term depends on one parameter: its share of J^T J is diagonal.

@@ -52,7 +52,10 @@ class LimbSearch(nn.Module):
         self.register_buffer("own", body.part_moves[:, first].T, persistent=False)
 
     def forward(
-        self, observation: Observation, pose: Float[Tensor, "1 parameters"], size: Float[Tensor, "#batch sizes"]
+        self,
+        observation: Observation,
+        pose: Float[Tensor, "1 parameters"],
+        size: Float[Tensor, "#batch sizes"],
     ) -> Float[Tensor, "limbs best parameters"]:
         """For each limb the best poses that differ from `pose` in that limb alone."""
         L, C = self.places.shape[:2]
@@ -91,10 +94,14 @@ class LimbSearch(nn.Module):
             score = score - 0.5 * rows.residual(limb).square().sum(1)
         return score.unflatten(0, (L, C))
 
-    def _rest_of_body(self, observation: Observation, pose: Tensor, size: Tensor) -> Float[Tensor, "limbs num"]:
+    def _rest_of_body(
+        self, observation: Observation, pose: Tensor, size: Tensor
+    ) -> Float[Tensor, "limbs num"]:
         """Log-density of each point by all parts but a limb's own, and by none."""
         posed = self.body(pose, size)
-        square = (foot_point(posed, observation.cloud.points, self.registrar.config.visible).residual ** 2).sum(-1)
+        square = (
+            foot_point(posed, observation.cloud.points, self.registrar.config.visible).residual ** 2
+        ).sum(-1)
         potential = observation.potential.mT - square / (2 * self.config.sigma**2)  # (1, parts, N)
         potential = potential.masked_fill(self.own[:, :, None], -torch.inf)
         none = torch.full_like(potential[:, :1], -0.5 * max(self.registrar.config.outlier, 3.0) ** 2)

@@ -115,8 +115,12 @@ class Registration:
     ]  # q(label) of each point; the last label is "no part" where there is one
     distance: Float[Tensor, "batch num"]  # m, to the nearest part; 0 on padding
     point_to_model: Float[Tensor, " batch"]  # m, (5.2): the mean of `distance` over the points
-    misfit: Float[Tensor, " batch"]  # m, capped distances plus overhang: whether this can be the person at all
-    score: Float[Tensor, " batch"]  # nats, minus the log of the joint density: compares starts, less is better
+    misfit: Float[
+        Tensor, " batch"
+    ]  # m, capped distances plus overhang: whether this can be the person at all
+    score: Float[
+        Tensor, " batch"
+    ]  # nats, minus the log of the joint density: compares starts, less is better
     bound: Float[Tensor, "rounds batch"]  # (C.8) after each VE-step, at that round's sigma
     status: Int[Tensor, " batch"]  # of the last M-step, see `Status`
 
@@ -233,7 +237,9 @@ class Registrar(nn.Module):
             weight = ((best < K) & cloud.mask).to(belief)
             support = weight.new_zeros(B, K).scatter_add(1, part, weight)
             pick = part[:, None, None].expand(-1, 1, 3, -1)
-            local, normal, gap = (x.mT.gather(1, pick)[:, 0] for x in (foot.local, foot.normal, foot.residual))
+            local, normal, gap = (
+                x.mT.gather(1, pick)[:, 0] for x in (foot.local, foot.normal, foot.residual)
+            )
             target = cloud.points.mT
         else:
             part = torch.arange(K, device=belief.device).repeat_interleave(N).expand(B, -1)

@@ -1,0 +1,106 @@
+"""Limbs that were put elsewhere are found again, on bodies that are seen exactly."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from synthetic_cloud import CAMERA, mirrored, see, standing
+from torch.testing import assert_close
+
+from torchpose.body.model import BodyModel
+from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
+from torchpose.registration.silhouette import RimConfig
+from torchpose.registration.vem import Registrar, RegistrationConfig
+
+
+@pytest.fixture(scope="module")
+def scene():
+    body = BodyModel()
+    registrar = Registrar(body)
+    pose = standing(body, yaw=0.2)
+    return body, registrar, LimbSearch(body, registrar), pose, see(body, pose).observation()
+
+
+def worst_joint(body, found, truth):
+    return (body(found).joints - body(truth).joints).norm(dim=-1).amax(1)
+
+
+def test_arms_and_legs_are_searched_with_their_own_parts(scene):
+    body, _, search, _, _ = scene
+    names = [{body.parameter_names[i] for i in limb} for limb in search.limbs.tolist()]
+    arm, leg = ("upper_arm", "forearm", "hand"), ("thigh", "shank", "foot")
+    expected = [{f"{part}_{side}" for part in limb} for limb in (arm, leg) for side in ("left", "right")]
+    assert [{body.segment_names[k] for k in own.nonzero()[:, 0]} for own in search.own] == expected
+    assert len(set.union(*names)) == 16
+    assert (search.places >= body.low[search.limbs][:, None]).all()
+    assert (search.places <= body.high[search.limbs][:, None]).all()
+
+
+@pytest.mark.parametrize("limb", range(4), ids=["left arm", "right arm", "left leg", "right leg"])
+def test_a_limb_that_was_put_elsewhere_is_found_again(scene, limb):
+    """Of the places found, the one that fits best ends within 5 cm in every joint."""
+    body, registrar, search, pose, observation = scene
+    own, size = search.limbs[limb], body.default_size(1)
+    moved = pose.clone()
+    # As far from where it is as its limits allow.
+    low, high = body.low[own], body.high[own]
+    moved[0, own] = torch.where(pose[0, own] - low > high - pose[0, own], low, high)
+    assert worst_joint(body, moved, pose) > 0.4
+    found = search(observation, moved, size)
+    assert found.shape == (4, 3, body.num_parameters)
+    fitted = registrar(observation, found[limb], size, rounds=10, sigma_first=0.15)
+    best = fitted.pose[fitted.score.argmin()][None]
+    assert worst_joint(body, best, pose) < 0.05
+    others = torch.ones(body.num_parameters, dtype=torch.bool)
+    others[own] = False
+    assert (found[limb][:, others] == moved[:, others]).all()
+
+
+def test_every_limb_is_sought_alone(scene):
+    body, _, search, pose, observation = scene
+    found = search(observation, pose, body.default_size(1))
+    for limb, own in enumerate(search.limbs):
+        changed = (found[limb] != pose).any(0).nonzero()[:, 0]
+        assert set(changed.tolist()) <= set(own.tolist())
+        rows = (search.places[limb][:, None] == found[limb][None, :, own]).all(2).any(0)
+        assert rows.all()  # each is one of the places
+
+
+def test_the_mirrored_scene_has_the_mirrored_limbs():
+    """Equal parameters of left and right limbs are mirrored poses. Without rims, whose points are not mirrored."""
+    body = BodyModel().double()
+    camera = replace(CAMERA, cx=(CAMERA.width - 1) / 2)
+    pose = standing(body)
+    view = see(body, pose, num=200, camera=camera)
+    search = LimbSearch(body, Registrar(body, RegistrationConfig(rim=RimConfig(weight=0.0))))
+    size = body.default_size(1)
+    other_pose = pose.clone()
+    other_pose[:, 0] *= -1  # it faces the camera: the rest is its own mirror image but for the limbs
+    left, right = search.limbs[[0, 2]], search.limbs[[1, 3]]
+    other_pose[:, left], other_pose[:, right] = pose[:, right], pose[:, left]
+    found = search(view.observation(), pose, size)
+    other = search(mirrored(view).observation(), other_pose, size)
+    for a, b in ((0, 1), (1, 0), (2, 3), (3, 2)):
+        assert_close(other[b][:, search.limbs[b]], found[a][:, search.limbs[a]])
+
+
+def test_points_that_are_not_numbers_still_give_places(scene):
+    body, _, search, pose, observation = scene
+    points = torch.full_like(observation.cloud.points, torch.nan)
+    broken = replace(observation, cloud=replace(observation.cloud, points=points))
+    found = search(broken, pose, body.default_size(1))
+    assert found.shape == (4, 3, body.num_parameters)
+    assert found.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"best": 0}, "1 <= best <= shortlist <= candidates must hold, got .*best=0"),
+        ({"shortlist": 600}, "1 <= best <= shortlist <= candidates must hold, got .*shortlist=600"),
+        ({"sigma": 0.0}, "sigma must be positive, in m, got 0.0"),
+    ],
+)
+def test_bad_settings_are_told(setting, message):
+    with pytest.raises(ValueError, match=message):
+        LimbSearchConfig(**setting)
