@@ -1,4 +1,4 @@
-"""The smoother: its linear algebra against dense matrices, its estimates against exact conditioning, its habits by views."""
+"""The smoother: linear algebra against dense matrices, estimates against exact conditioning, habits by views."""
 
 import math
 from dataclasses import replace
@@ -156,7 +156,7 @@ def test_a_linear_chain_is_exact_conditioning_of_one_big_gaussian():
 
 
 def test_unseen_frames_lie_between_their_neighbours_and_less_surely_the_farther_these_are():
-    """A Brownian bridge: over a gap of n steps of variance q, after k, the variance q k (n - k) / n joins that of the ends."""
+    """A Brownian bridge: over n steps of variance q, after k of them, the variance is q k (n - k) / n."""
     T, q = 9, 0.04
     precision = torch.zeros(T, P, P, dtype=torch.float64)
     precision[[0, -1]] = 1e8 * torch.eye(P, dtype=torch.float64)
@@ -202,7 +202,7 @@ def test_stretches_are_the_whole_where_the_later_frames_say_nothing():
 
 
 def test_stretches_that_hear_of_coming_frames_are_near_the_whole():
-    """Frames 0 to 9 with 6 more in view, then 10 to 19: twice heard, the six may pull a pose too far, within its doubt."""
+    """Frames 0 to 9 with 6 more in view, then 10 to 19: the six are heard twice, which stays within a pose's doubt."""
     for seed in range(5):
         precision, mean, chain = random_problem(20, torch.Generator().manual_seed(seed))
         whole, whole_covariance, _ = fitted(precision, mean, chain)
@@ -325,7 +325,7 @@ def test_a_limb_lost_in_one_frame_is_recovered_from_a_neighbour(body, scene):
 
 
 def test_a_frame_that_is_right_does_not_follow_a_neighbour_that_is_wrong(body, scene):
-    """A wrong frame between a right neighbour and a wrong one, on either side: what one shows the other does not undo."""
+    """A wrong frame between a right neighbour and a wrong one: what one side shows the other does not undo."""
     pose, observation, registrar, found = scene
     names = arm(body)
     lost = found.pose.clone()
@@ -496,8 +496,8 @@ def test_the_truth_lies_within_two_sd(body, labelled):
     assert 0.90 < (torch.cat(off).abs() < 2).float().mean() < 0.99
 
 
-def test_taken_rows_are_the_frames_one_by_one_and_put_back(body, scene):
-    pose, observation, registrar, found = scene
+def test_taken_rows_are_the_frames_one_by_one_and_put_back(scene):
+    _, observation, _, found = scene
     index = torch.tensor([4, 1, 1])
     some = observation.take(index)
     for row, i in enumerate(index):

@@ -1,21 +1,27 @@
-"""Colours of the body's parts, learned from the person while following: skin, shirt, trousers and shoes tell parts apart.
+"""Colours of the body's parts, learned while following: skin, shirt, trousers and shoes tell parts apart.
 
-An appearance term as (3.9), of which the thesis has two; this one learns in the run and from the run alone. Colours are RGB in
-[0, 1] on the way in.
+An appearance term as (3.9), of which the thesis has two; this one learns in the run and from the run alone. Colours are
+RGB in [0, 1] on the way in.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from kornia.color import rgb_to_lab
 from torch import Tensor
 
 from torchpose.registration.likelihood import Evidence, PartLikelihood
 
 BINS = (7, 12, 12)  # of lightness, of green to red and of blue to yellow
-LOW, HIGH = (0.0, -48.0, -48.0), (100.0, 48.0, 48.0)  # what the bins span in CIELAB; few clothes are more colourful
+LOW, HIGH = (
+    (0.0, -48.0, -48.0),
+    (100.0, 48.0, 48.0),
+)  # what the bins span in CIELAB; few clothes are more colourful
+CORNERS = ((0, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1))
+RARE = 1e-5  # share of the person's colours that any colour may have; what was hardly seen says nothing of any part
 
 
 @dataclass(frozen=True)
@@ -27,29 +33,49 @@ class ColourConfig:
     memory: float = 150.0  # frames, over which what was learned fades
 
     def __post_init__(self) -> None:
-        if self.strength < 0 or not 0 < self.floor < 1:
-            raise ValueError(f"strength >= 0 and 0 < floor < 1 must hold, got {self.strength} and {self.floor}")
+        if not self.strength >= 0:
+            raise ValueError(
+                f"strength must not be negative, got {self.strength}; 0 switches the colours off"
+            )
+        if not 0 < self.floor < 1:
+            raise ValueError(f"floor must be a share between 0 and 1, got {self.floor}")
+        for name in ("near", "trust"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not self.memory >= 1:
+            raise ValueError(f"memory must be at least 1 frame, got {self.memory}")
 
 
 class ColourLikelihood(PartLikelihood):
     """log p(colour | part) - log p(colour) of each point. Left and right parts share their colours."""
 
-    counts: Tensor  # (parts, bins) points seen; a sided pair's rows are equal
+    counts: Float[Tensor, "parts bins"]  # points seen; a sided pair's rows are equal
+    other_side: Int[Tensor, " parts"]  # the part itself, where it has no other side
+    lowest: Float[Tensor, " 3"]  # CIELAB, of the first bin's middle
+    spacing: Float[Tensor, " 3"]  # CIELAB, from bin to bin
+    corners: Int[Tensor, "corners 3"]
 
     def __init__(self, segment_names: Sequence[str], config: ColourConfig = ColourConfig()):
         super().__init__(segment_names)
         self.config = config
-        other = [
-            self.segment_names.index(n.replace("_left", "_#").replace("_right", "_left").replace("_#", "_right"))
-            for n in self.segment_names
-        ]
-        self.other_side = other
-        self.register_buffer("counts", torch.zeros(len(other), BINS[0] * BINS[1] * BINS[2]), persistent=False)
+        low, high, last = torch.tensor(LOW), torch.tensor(HIGH), torch.tensor(BINS) - 1
+        other = [self.segment_names.index(_other_side(name)) for name in self.segment_names]
+        for name, value in {
+            "counts": torch.zeros(len(other), math.prod(BINS)),
+            "other_side": torch.tensor(other),
+            "lowest": low,
+            "spacing": (high - low) / last,
+            "corners": torch.tensor(CORNERS),
+        }.items():
+            self.register_buffer(name, value, persistent=False)
 
     def forget(self) -> None:
+        """Start as if no colour had been seen."""
         self.counts.zero_()
 
     def forward(self, evidence: Evidence) -> Float[Tensor, "batch num parts"]:
+        """Log-potentials of the parts: 0 on padding and while nothing is learned, never below
+        `strength` log `floor`."""
         place, share = self._bins(evidence)
         total = self.counts.sum(0)
         person = total / total.sum().clamp_min(1)
@@ -57,44 +83,57 @@ class ColourLikelihood(PartLikelihood):
         trust = mass / (mass + self.config.trust)
         part = trust * self.counts / mass.clamp_min(1e-6) + (1 - trust) * person
         floor = self.config.floor
-        # Nearly unseen colours say nothing of any part.
-        ratio = ((1 - floor) * part + floor * person + 1e-5) / (person + 1e-5)
+        ratio = ((1 - floor) * part + floor * person + RARE) / (person + RARE)
         value = (ratio[:, place] * share).sum(-1)  # (parts, B, N)
         log = self.config.strength * value.log() * evidence.cloud.mask
         return log.permute(1, 2, 0)
 
-    def learn(self, evidence: Evidence, belief: Tensor, distance: Tensor) -> None:
-        """Add the colours of points that lie near the surface of the part they are believed to be of."""
+    def learn(
+        self,
+        evidence: Evidence,
+        belief: Float[Tensor, "batch labels num"],
+        distance: Float[Tensor, "batch num"],
+    ) -> None:
+        """Add the colours of points that lie near the surface of the part they are believed to be of.
+
+        Args:
+            belief: of each label; those after the parts are left out.
+            distance: of each point to the nearest part, m.
+        """
         place, share = self._bins(evidence)
         sure = (distance < self.config.near) & evidence.cloud.mask
         weight = belief[:, : len(self.segment_names)] * sure[:, None]
-        weight = weight + weight[:, self.other_side]
-        table = self.counts.new_zeros(self.counts.shape)
-        flat = place.flatten(1)  # (B, N * 8)
-        for row in range(len(flat)):
-            spread = (weight[row][..., None] * share[row]).flatten(1)
-            table.index_add_(1, flat[row], spread)
-        self.counts.mul_(1 - 1 / self.config.memory).add_(table)
+        weight = (weight + weight[:, self.other_side]).transpose(0, 1).flatten(1)  # (parts, B N)
+        spread = (weight[..., None] * share.flatten(0, 1)).flatten(1)
+        self.counts.mul_(1 - 1 / self.config.memory).index_add_(1, place.flatten(), spread)
 
-    def _bins(self, evidence: Evidence) -> tuple[Tensor, Tensor]:
+    def _bins(
+        self, evidence: Evidence
+    ) -> tuple[Int[Tensor, "batch num corners"], Float[Tensor, "batch num corners"]]:
         """The eight bins around each point's colour and the share of each."""
-        B, _, H, W = evidence.images.shape
-        u, v = evidence.cloud.pixels.round().long().unbind(-1)
-        around = torch.arange(-1, 2, device=u.device)
-        rows = (v[..., None] + around).clamp(0, H - 1)[..., :, None]
-        columns = (u[..., None] + around).clamp(0, W - 1)[..., None, :]
-        index = (rows * W + columns).flatten(1)[:, None].expand(-1, 3, -1)
-        colour = evidence.images.flatten(2).gather(2, index).unflatten(2, (-1, 9)).mean(-1)
-        lab = rgb_to_lab(colour[..., None].clamp(0, 1))[..., 0].transpose(1, 2)  # (B, N, 3)
-        low, high, bins = (torch.tensor(x, dtype=lab.dtype, device=lab.device) for x in (LOW, HIGH, BINS))
-        at = ((lab - low) / (high - low)).clamp(0, 1) * (bins - 1)
-        corner = torch.minimum(at.floor(), bins - 2)
+        lab = rgb_to_lab(_colours(evidence).mT[..., None])[..., 0].mT  # (B, N, 3)
+        last = torch.tensor(BINS, device=lab.device) - 1
+        at = torch.minimum(((lab - self.lowest) / self.spacing).clamp_min(0), last)[..., None, :]
+        corner = torch.minimum(at.floor(), last - 1)
         rest = at - corner
-        place = torch.zeros(*lab.shape[:2], 8, dtype=torch.long, device=lab.device)
-        share = torch.ones(*lab.shape[:2], 8, dtype=lab.dtype, device=lab.device)
-        for bit in range(8):
-            step = torch.tensor([bit >> k & 1 for k in range(3)], device=lab.device)
-            cell = (corner + step).long()
-            place[..., bit] = (cell[..., 0] * BINS[1] + cell[..., 1]) * BINS[2] + cell[..., 2]
-            share[..., bit] = torch.where(step.bool(), rest, 1 - rest).prod(-1)
-        return place, share
+        share = torch.where(self.corners.bool(), rest, 1 - rest).prod(-1)
+        lightness, red, yellow = (corner.long() + self.corners).unbind(-1)
+        return (lightness * BINS[1] + red) * BINS[2] + yellow, share
+
+
+def _colours(evidence: Evidence) -> Float[Tensor, "batch num 3"]:
+    """Mean RGB of the 3 x 3 pixels around each point; at the border the last pixel stands for those beyond."""
+    H, W = evidence.images.shape[2:]
+    column, row = evidence.cloud.pixels.round().long()[..., None].unbind(2)
+    around = torch.arange(-1, 2, device=row.device)
+    rows, columns = (row + around).clamp(0, H - 1), (column + around).clamp(0, W - 1)  # (B, N, 3)
+    index = (rows[..., :, None] * W + columns[..., None, :]).flatten(1)[:, None].expand(-1, 3, -1)
+    near = evidence.images.flatten(2).gather(2, index).unflatten(2, (-1, 9))
+    return near.mean(-1).clamp(0, 1).mT
+
+
+def _other_side(name: str) -> str:
+    for one, other in (("_left", "_right"), ("_right", "_left")):
+        if name.endswith(one):
+            return name.removesuffix(one) + other
+    return name

@@ -171,7 +171,7 @@ class Smoother(nn.Module):
     def _try_neighbours(
         self, observation: Observation, now: Registration, pull: Tensor, size: Tensor
     ) -> Registration:
-        """Each frame that differs from a neighbour is fitted anew, from its own pose and from there, and keeps the best.
+        """Each frame that differs from a neighbour is fitted anew, from its own pose and from there; the best is kept.
 
         All three poses are weighed with the same prior, that of both neighbours: with the prior of one, a frame that is
         right would follow a neighbour that is wrong.
