@@ -27,19 +27,21 @@ def view(body):
     return see(body, standing(body), num=60)
 
 
-def registration(pose, misfit=GOOD, stray=0.0, status=Status.CONVERGED):
-    """Registrations of these poses, of whose 100 points a share strays."""
+def registration(pose, misfit=GOOD, stray=0.0, status=Status.CONVERGED, score=None):
+    """Registrations of these poses, of whose 100 points a share is of no part."""
     B, P = pose.shape
     distance = torch.full((B, 100), 0.005)
-    distance[:, : round(100 * stray)] = 0.5
+    belief = torch.full((B, 15, 100), (1 - stray) / 14)
+    belief[:, -1] = stray
     level = torch.full((B,), misfit)
     return Registration(
         pose,
         torch.eye(P).expand(B, P, P),
-        torch.full((B, 15, 100), 1 / 15),
+        belief,
         distance,
         distance.mean(1),
         level,
+        1000 * level if score is None else torch.full((B,), score),
         torch.zeros(1, B),
         torch.full((B,), int(status)),
     )
@@ -62,14 +64,15 @@ class ScriptedStarter(Starter):
     def __init__(self, body):
         super().__init__(body, StartConfig(), RegistrationConfig())
         self.pose, self.misfit, self.refreshed, self.status = None, GOOD, None, Status.CONVERGED
-        self.calls = []
+        self.calls, self.prior = [], None
 
     def forward(self, observation, faces, size):
         self.calls.append("cold")
         return registration(self.pose, self.misfit, status=self.status)
 
-    def refresh(self, observation, pose, size):
+    def refresh(self, observation, pose, size, prior=None):
         self.calls.append("refresh")
+        self.prior = prior
         return registration(pose, BAD) if self.refreshed is None else self.refreshed
 
 
@@ -170,9 +173,9 @@ def test_a_lost_person_is_remembered_for_a_while_and_then_forgotten(scripted, st
     step(tracker, 0.0)
     calls = len(starter.calls)
     assert step(tracker, CONFIG.memory - 0.1).status is TrackStatus.tracked
-    assert len(starter.calls) == calls  # followed, not searched for
+    assert starter.calls[calls:] == ["refresh"]  # followed, not searched for from nothing
     step(tracker, 2 * CONFIG.memory + 0.1)
-    assert starter.calls[calls:] == ["cold"]
+    assert starter.calls[calls + 1 :] == ["cold"]
     registrar.misfit = starter.misfit = BAD
     assert step(tracker, 2 * CONFIG.memory + 0.2).status is TrackStatus.lost
     # Lost frames do not prolong the memory.
@@ -193,6 +196,82 @@ def test_stray_points_have_the_limbs_sought(scripted, step, body):
     assert frame.registration.misfit == GOOD  # what does not fit better is not taken
 
 
+def test_limbs_are_sought_again_and_again_though_nothing_seems_wrong(scripted, step):
+    tracker, _, starter = scripted
+    step(tracker, 0.0)
+    step(tracker, 0.05)
+    assert starter.calls == ["cold", "refresh"]
+    gap = CONFIG.look_around
+    for time_s, count in (
+        (0.05 + 0.5 * gap, 1),
+        (0.05 + 0.9 * gap, 1),
+        (0.06 + gap, 2),
+        (0.06 + 1.5 * gap, 2),
+    ):
+        step(tracker, time_s)
+        assert starter.calls == ["cold"] + count * ["refresh"]
+
+
+def test_an_answer_is_judged_by_its_score_not_by_its_misfit(scripted, step, body):
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    registrar.stray = 2 * CONFIG.stray_share
+    worse = registration(standing(body) + 0.01, misfit=GOOD / 2, score=1000 * GOOD + 1)
+    starter.refreshed = worse
+    assert step(tracker, 0.1).registration.misfit == GOOD
+    better = registration(standing(body) + 0.01, misfit=2 * GOOD, score=1000 * GOOD - 1)
+    starter.refreshed = better
+    assert step(tracker, 0.1 + 2 * CONFIG.look_around).registration is better
+    starter.refreshed = replace(better, score=torch.tensor([torch.nan]))
+    assert step(tracker, 0.1 + 4 * CONFIG.look_around).registration.misfit == GOOD
+
+
+def test_limbs_are_sought_within_a_looser_prediction(scripted, step):
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    step(tracker, 0.1)
+    assert_close(starter.prior.mean, registrar.prior.mean[:1])
+    assert_close(starter.prior.precision.rsqrt(), CONFIG.search_slack * registrar.prior.precision[:1].rsqrt())
+
+
+def test_points_that_stay_without_a_part_are_sought_for_once(scripted, step):
+    """A bag: it strays after the search, too, and only half as much again is a reason for another one."""
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    times = iter(0.01 * i for i in range(1, 100))  # well within `look_around`
+    step(tracker, next(times))
+    assert starter.calls.count("refresh") == 1
+    for stray, searches in ((0.1, 2), (0.1, 2), (0.14, 2), (0.16, 3), (0.2, 3), (0.01, 3), (0.1, 4)):
+        registrar.stray = stray
+        step(tracker, next(times))
+        assert starter.calls.count("refresh") == searches, stray
+
+
+def test_a_fit_that_is_not_acceptable_has_the_limbs_sought_before_a_cold_start(scripted, step, body):
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    step(tracker, 0.01)
+    registrar.misfit = BAD
+    starter.refreshed = registration(standing(body) + 0.01)
+    assert step(tracker, 0.02).status is TrackStatus.tracked
+    assert starter.calls == ["cold", "refresh", "refresh"]
+    starter.refreshed = None
+    assert step(tracker, 0.03).status is TrackStatus.recovered
+    assert starter.calls[3:] == ["refresh", "cold"]
+
+
+def test_of_prediction_and_last_pose_the_better_score_is_kept(scripted, step, body):
+    tracker, registrar, _ = scripted
+    step(tracker, 0.0)
+    step(tracker, 0.01)
+    for scores, best in (([2.0, 1.0], 1), ([1.0, 2.0], 0), ([torch.nan, 5.0], 1)):
+        both = registration(torch.cat([standing(body), standing(body, x=0.01)]))
+        both = replace(both, score=torch.tensor(scores), misfit=torch.tensor([0.02, 0.03]))
+        registrar.forward = lambda *_, both=both: both
+        frame = step(tracker, tracker.state()["time"].item() + 0.01)
+        assert torch.equal(frame.registration.pose, both.pose[best : best + 1])
+
+
 def test_an_answer_that_is_not_finite_is_none(scripted, step, body):
     tracker, _, starter = scripted
     starter.status = Status.NON_FINITE
@@ -209,7 +288,7 @@ def test_forgetting_starts_over_and_begin_takes_a_known_pose(scripted, step, bod
     assert starter.calls == ["cold", "cold"]
     tracker.begin(standing(body, x=0.3), 0.2)
     step(tracker, 0.25)
-    assert starter.calls == ["cold", "cold"]
+    assert starter.calls == ["cold", "cold", "refresh"]  # of a pose that was given no limb has been sought
     assert_close(registrar.starts, standing(body, x=0.3).expand(2, -1))
 
 
@@ -221,13 +300,26 @@ def test_a_restored_track_goes_on_as_if_never_stopped(scripted, step, body):
     other = Tracker(body, CONFIG, registrar, starter)
     other.restore(tracker.state())
     step(tracker, 0.2)
-    expected = registrar.starts
+    expected, calls = registrar.starts, list(starter.calls)
     step(other, 0.2)
     assert_close(registrar.starts, expected)
+    assert starter.calls == calls  # limbs were sought a moment ago, which is remembered
     other.forget()
     assert other.state() == {}
     other.restore({})
     assert step(other, 0.3, present=False).status is TrackStatus.absent
+
+
+def test_a_restored_search_in_vain_is_not_repeated_at_once(scripted, step, body):
+    tracker, registrar, starter = scripted
+    starter.misfit = BAD
+    step(tracker, 0.0)
+    other = Tracker(body, CONFIG, registrar, starter)
+    other.restore(tracker.state())
+    step(other, 0.5 * CONFIG.retry)
+    assert starter.calls == ["cold"]
+    step(other, 1.1 * CONFIG.retry)
+    assert starter.calls == ["cold", "cold"]
 
 
 def moving(body, t):
@@ -276,6 +368,8 @@ def test_an_identical_frame_has_the_identical_pose(body):
     [
         ({"velocity": 1.5}, "velocity must be between 0 and 1, got 1.5"),
         ({"memory": 0.0}, "memory must be positive, got 0.0"),
+        ({"look_around": 0.0}, "look_around must be positive, got 0.0"),
+        ({"search_slack": -1.0}, "search_slack must be positive, got -1.0"),
         ({"accept_misfit": -1.0}, "accept_misfit must be positive, got -1.0"),
     ],
 )

@@ -42,7 +42,9 @@ class TrackingConfig:
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
-    search_slack: float = 3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
+    search_slack: float = (
+        3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
+    )
     look_around: float = 0.25  # s after which limbs are sought elsewhere although nothing seems wrong
     memory: float = 2.0  # s after which a lost person is forgotten
 
@@ -94,18 +96,21 @@ class Tracker(nn.Module):
 
     def state(self) -> dict[str, Tensor]:
         """What the next frame starts from, as tensors; empty where nothing is remembered."""
-        if self._pose is None:
-            return {}
-        state = {"pose": self._pose, "time": torch.tensor(self._time, dtype=torch.float64)}
+        poses: dict[str, Tensor] = {}
+        memory = {} if self._failed == -math.inf else {"failed": self._failed}
+        if self._pose is not None:
+            poses["pose"] = self._pose
+            memory |= {"time": self._time, "known_stray": self._known_stray, "looked": self._looked}
         if self._velocity is not None:
-            state["velocity"] = self._velocity
-        memory = {"known_stray": self._known_stray, "looked": self._looked}
-        return state | {name: torch.tensor(value, dtype=torch.float64) for name, value in memory.items()}
+            poses["velocity"] = self._velocity
+        return poses | {name: torch.tensor(value, dtype=torch.float64) for name, value in memory.items()}
 
     def restore(self, state: Mapping[str, Tensor], device: torch.device | None = None) -> None:
-        """Go on from a `state`."""
+        """Go on from a `state`; poses go to where the body is."""
         self.forget()
-        if state:
+        if "failed" in state:
+            self._failed = float(state["failed"])
+        if "pose" in state:
             self._pose, self._time = state["pose"].to(self.body.axes), float(state["time"])
             self._velocity = state["velocity"].to(self.body.axes) if "velocity" in state else None
             self._known_stray, self._looked = float(state["known_stray"]), float(state["looked"])
