@@ -125,6 +125,7 @@ class Knows(nn.Module):
             distance=torch.zeros(1, 1),
             point_to_model=torch.zeros(1),
             misfit=torch.full((1,), self.misfit),
+            score=torch.full((1,), 1000 * self.misfit),
             bound=torch.zeros(1, 1),
             status=torch.zeros(1, dtype=torch.long),
         )

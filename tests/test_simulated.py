@@ -218,8 +218,12 @@ def test_true_limb_angles_are_those_of_the_limbs(take: Take):
             torch.testing.assert_close(angles[f"{joint}_{side}_limb"], expected, atol=2e-3, rtol=0)
             torch.testing.assert_close(anatomical[f"{joint}_flexion_{side}"], expected, atol=2e-3, rtol=0)
     size = dict(zip(BODY.size_names, take.size[0].tolist(), strict=True))
-    bones = {("shoulder", "elbow"): 0.285 * size["upper_arm"], ("hip", "knee"): 0.40 * size["thigh"]}
-    for (upper, lower), length in bones.items():
+    bodies = yaml.safe_load(HUMAN.read_text())["bodies"]
+    for upper, lower, bone, child in (
+        ("shoulder", "elbow", "upper_arm", "forearm"),
+        ("hip", "knee", "thigh", "shank"),
+    ):
+        length = math.hypot(*bodies[child]["origin"][bone]) * size[bone]
         bone = (take.joints[:, JOINT[f"{upper}_left"]] - take.joints[:, JOINT[f"{lower}_left"]]).norm(dim=-1)
         torch.testing.assert_close(bone, torch.full_like(bone, length), atol=1e-5, rtol=0)
 
@@ -246,6 +250,7 @@ def followed(take: Take, poses: torch.Tensor, sd: float = 0.01, missing: tuple[i
             distance=torch.zeros(1, 1),
             point_to_model=torch.full((1,), 0.012),
             misfit=torch.zeros(1),
+            score=torch.zeros(1),
             bound=torch.zeros(1, 1),
             status=torch.zeros(1, dtype=torch.long),
         )

@@ -20,6 +20,7 @@ from torchpose.registration.vem import (
     Observation,
     Registrar,
     RegistrationConfig,
+    foot_of_part,
     is_finite,
 )
 from torchpose.vision.points import group_cells
@@ -174,6 +175,18 @@ def test_gradients_through_the_whole_registration_are_finite(scene):
             assert gradient.abs().max() > 0
     for gradient in torch.autograd.grad(found.score.sum(), (potential,)):
         assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("visible", [True, False])
+def test_the_foot_on_one_part_is_that_of_all_parts(scene, visible):
+    body, pose, view = scene
+    starts = torch.cat([off(pose, 10, seed) for seed in range(3)])
+    posed, points = body(starts), view.cloud.points.expand(3, -1, -1)
+    part = torch.randint(body.num_parts, points.shape[:2])
+    every, own = foot_point(posed, points, visible), foot_of_part(posed, part, points, visible)
+    for name in ("local", "normal", "residual", "hidden"):
+        batch, point = torch.arange(3)[:, None], torch.arange(points.shape[1])
+        assert_close(getattr(own, name)[:, 0], getattr(every, name)[batch, part, point], rtol=0, atol=1e-5)
 
 
 def test_a_batch_of_frames_equals_one_by_one():
@@ -368,6 +381,8 @@ def test_the_thesis_as_written_runs_and_stays_near():
     "switch",
     [
         {"distance": Distance.algebraic},
+        {"distance": Distance.euclidean},
+        {"distance": Distance.first_order, "hard": False},
         {"visible": False},
         {"outlier": 0.0},
         {"hard": False},

@@ -17,7 +17,6 @@ from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import (
     Linearize,
     LMConfig,
-    NormalEquations,
     Residual,
     Solution,
     Status,

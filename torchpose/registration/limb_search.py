@@ -1,12 +1,13 @@
 """Other places for one limb: many of them are scored against the points while the rest of the body stays.
 
-The hierarchical step (T. 6.2.1): the root is known, the chains outward are sought. Left-camera frame, metres and radians.
+The hierarchical step (T. 6.2.1): the root is known, the chains outward are sought. Left-camera frame, metres and
+radians.
 """
 
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose.body.ellipsoid import foot_point, rough_distance

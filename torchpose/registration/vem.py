@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.ellipsoid import FootPoint, algebraic_distance, foot_point
+from torchpose.body.ellipsoid import FootPoint, algebraic_distance, foot_point, rough_distance
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import Status
 from torchpose.registration.fitting import (
@@ -32,6 +32,9 @@ from torchpose.vision.points import PointCloud
 class Distance(Enum):
     """What the labels are judged by: metres to the surface, or the cheaper and biased q(X) of (3.3)."""
 
+    first_order = (
+        "first_order"  # metres, `rough_distance` while the pose is sought; the answer is measured exactly
+    )
     euclidean = "euclidean"
     algebraic = "algebraic"
 
@@ -41,7 +44,7 @@ class RegistrationConfig:
     rounds: int = 5  # VE-steps, each followed by an M-step
     sigma_first: float = 0.10  # m, of the reconstruction term (3.13) in the first round
     sigma_last: float = 0.03  # m, in the last; in between it falls geometrically
-    distance: Distance = Distance.euclidean
+    distance: Distance = Distance.first_order
     visible: bool = True  # correspond with the side that the camera sees
     outlier: float = 3.0  # sigmas beyond which a point rather has no part; 0 gives every point a part
     hard: bool = True  # each point answers to its best label alone; soft costs 14 times the rows
@@ -174,7 +177,9 @@ class Registrar(nn.Module):
             share = i / max(rounds - 1, 1)
             sigma = sigma_first ** (1 - share) * config.sigma_last**share
             posed = self.body(pose, size)
-            foot = self.correspond(posed, observation)
+            # With hard labels at first order only each point's own part needs its foot point: a fourteenth of them.
+            few = config.hard and config.distance is Distance.first_order
+            foot = None if few else self.correspond(posed, observation)
             labelling = self.label(posed, foot, observation, sigma)
             bounds.append(labelling.bound[-1])
             rim = i >= rounds - config.rim.last_rounds
@@ -188,10 +193,17 @@ class Registrar(nn.Module):
         """The model's point that answers for each data point, on every part."""
         return foot_point(posed, observation.cloud.points, self.config.visible)
 
-    def label(self, posed: PosedBody, foot: FootPoint, observation: Observation, sigma: float) -> Labelling:
-        """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled."""
+    def label(
+        self, posed: PosedBody, foot: FootPoint | None, observation: Observation, sigma: float
+    ) -> Labelling:
+        """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled.
+
+        Without foot points the distances are those to first order.
+        """
         if self.config.distance is Distance.algebraic:
             square = algebraic_distance(posed, observation.cloud.points) ** 2
+        elif foot is None:
+            square = rough_distance(posed, observation.cloud.points, self.config.visible) ** 2
         else:
             square = (foot.residual**2).sum(-1)
         potential = observation.potential.mT - square / (2 * sigma**2)
@@ -206,12 +218,15 @@ class Registrar(nn.Module):
     def rows(
         self,
         posed: PosedBody,
-        foot: FootPoint,
+        foot: FootPoint | None,
         labelling: Labelling,
         observation: Observation,
         rim: bool = True,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
+        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part.
+
+        Hard labels need no foot points of all parts: without, those of the points' own parts are found here.
+        """
         rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.rim)
@@ -223,7 +238,11 @@ class Registrar(nn.Module):
         return 3 * cloud.mask.shape[1] * (1 if self.config.hard else self.body.num_parts)
 
     def _point_rows(
-        self, posed: PosedBody, foot: FootPoint, belief: Float[Tensor, "batch labels num"], cloud: PointCloud
+        self,
+        posed: PosedBody,
+        foot: FootPoint | None,
+        belief: Float[Tensor, "batch labels num"],
+        cloud: PointCloud,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
         """Three rows for each pair of point and part, all first coordinates first; and the points on each part.
 
@@ -231,15 +250,17 @@ class Registrar(nn.Module):
         """
         config, K = self.config, self.body.num_parts
         B, N = cloud.mask.shape
-        if config.hard:
+        if config.hard or foot is None:
             best = belief.max(1).indices  # far faster than `argmax`
             part = best.clamp_max(K - 1)
             weight = ((best < K) & cloud.mask).to(belief)
             support = weight.new_zeros(B, K).scatter_add(1, part, weight)
-            pick = part[:, None, None].expand(-1, 1, 3, -1)
-            local, normal, gap = (
-                x.mT.gather(1, pick)[:, 0] for x in (foot.local, foot.normal, foot.residual)
+            own = (
+                foot_of_part(posed, part, cloud.points, config.visible)
+                if foot is None
+                else _of_part(foot, part)
             )
+            local, normal, gap = own.local[:, 0].mT, own.normal[:, 0].mT, own.residual[:, 0].mT
             target = cloud.points.mT
         else:
             part = torch.arange(K, device=belief.device).repeat_interleave(N).expand(B, -1)
@@ -318,6 +339,34 @@ def stack_registrations(found: Sequence[Registration]) -> Registration:
     names = [name for name in Registration.__dataclass_fields__ if name != "bound"]
     values = {name: torch.cat([getattr(one, name) for one in found]) for name in names}
     return Registration(**values, bound=torch.cat([one.bound[-1:] for one in found], 1))
+
+
+def foot_of_part(
+    posed: PosedBody,
+    part: Int[Tensor, "batch num"],
+    points: Float[Tensor, "batch num 3"],
+    visible: bool = True,
+) -> FootPoint:
+    """`foot_point` of each point on one part alone: (B, 1, N) pairs."""
+    B, N = part.shape
+
+    def own(value: Tensor) -> Tensor:
+        flat = value.flatten(2)
+        wide = part[..., None].expand(-1, -1, flat.shape[2])
+        return flat.gather(1, wide).view(B * N, 1, *value.shape[2:])
+
+    # Every point is a batch of its own, with one ellipsoid.
+    single = replace(posed, centers=own(posed.centers), frames=own(posed.frames), radii=own(posed.radii))
+    found = foot_point(single, points.flatten(0, 1)[:, None], visible)
+    local, normal, residual = (x.view(B, 1, N, 3) for x in (found.local, found.normal, found.residual))
+    return FootPoint(local, normal, residual, found.hidden.view(B, 1, N))
+
+
+def _of_part(foot: FootPoint, part: Int[Tensor, "batch num"]) -> FootPoint:
+    pick = part[:, None]
+    wide = pick[:, :, None].expand(-1, -1, 3, -1)
+    local, normal, residual = (x.mT.gather(1, wide).mT for x in (foot.local, foot.normal, foot.residual))
+    return FootPoint(local, normal, residual, foot.hidden.gather(1, pick))
 
 
 def _rows(value: Tensor, batch: int) -> Tensor:
