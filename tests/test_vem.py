@@ -381,7 +381,7 @@ def test_the_thesis_as_written_runs_and_stays_near():
     "switch",
     [
         {"distance": Distance.algebraic},
-        {"distance": Distance.euclidean},
+        {"distance": Distance.first_order},
         {"distance": Distance.first_order, "hard": False},
         {"visible": False},
         {"outlier": 0.0},

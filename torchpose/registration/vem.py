@@ -44,7 +44,7 @@ class RegistrationConfig:
     rounds: int = 5  # VE-steps, each followed by an M-step
     sigma_first: float = 0.10  # m, of the reconstruction term (3.13) in the first round
     sigma_last: float = 0.03  # m, in the last; in between it falls geometrically
-    distance: Distance = Distance.first_order
+    distance: Distance = Distance.euclidean
     visible: bool = True  # correspond with the side that the camera sees
     outlier: float = 3.0  # sigmas beyond which a point rather has no part; 0 gives every point a part
     hard: bool = True  # each point answers to its best label alone; soft costs 14 times the rows
@@ -355,8 +355,14 @@ def foot_of_part(
         wide = part[..., None].expand(-1, -1, flat.shape[2])
         return flat.gather(1, wide).view(B * N, 1, *value.shape[2:])
 
-    # Every point is a batch of its own, with one ellipsoid.
-    single = replace(posed, centers=own(posed.centers), frames=own(posed.frames), radii=own(posed.radii))
+    # Every point is a batch of its own, with one ellipsoid and nothing else of the body.
+    parts = {name: own(getattr(posed, name)) for name in ("centers", "frames", "radii")}
+    others = {
+        name: x.new_zeros(B * N, 0, *x.shape[2:])
+        for name in PosedBody.__dataclass_fields__
+        if name not in parts and isinstance(x := getattr(posed, name), Tensor)
+    }
+    single = replace(posed, **parts, **others)
     found = foot_point(single, points.flatten(0, 1)[:, None], visible)
     local, normal, residual = (x.view(B, 1, N, 3) for x in (found.local, found.normal, found.residual))
     return FootPoint(local, normal, residual, found.hidden.view(B, 1, N))
