@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.simulated import (
@@ -26,6 +27,7 @@ from benchmarks.simulated import (
 )
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, limb_angles
 from torchpose.body.model import BodyModel
+from torchpose.body.skeleton import HUMAN
 from torchpose.body.superquadric import DisplayModel, Person, implicit
 from torchpose.geometry import exp_rotation
 from torchpose.pipeline import FramePose, StereoToPose
