@@ -133,7 +133,7 @@ def _across(
 
     Beside the nearest point a flat ellipsoid can have one more that is nearer than all its neighbours, for points
     near the plane across its shortest axis: the root of N(s) next to the pole s = 0 from below. There Newton's
-    function is concave, too, and |p0 / s|^2 = 1 - Q(s) <= 1 - Q(0) bounds s, where Q is what the longer axes contribute.
+    function is concave, too, and |p0 / s|^2 = 1 - Q(s) <= 1 - Q(0) bounds s, Q being what the longer axes give.
     """
     half_axes = radii.mT
     p, d = _scaled(local.mT, half_axes)
