@@ -11,7 +11,7 @@ import yaml
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchpose.body.model import BodyConfig, BodyModel, JointKind, PosedBody, ellipsoid_matrix
+from torchpose.body.model import BodyConfig, BodyModel, JointKind, PosedBody, ellipsoid_matrix, frame_along
 from torchpose.body.skeleton import HUMAN
 from torchpose.geometry import exp_rotation, hat
 
@@ -374,6 +374,28 @@ class TestMirror:
         assert_close(two.rotations, flipped, atol=1e-12, rtol=0)
 
 
+class TestFrameAlong:
+    def test_columns(self) -> None:
+        axis = torch.nn.functional.normalize(torch.randn(50, 3, dtype=F64), dim=-1)
+        frame = frame_along(axis)
+        assert_close(frame @ frame.mT, torch.eye(3, dtype=F64).expand(50, 3, 3), atol=1e-12, rtol=0)
+        assert_close(torch.linalg.det(frame), torch.ones(50, dtype=F64), atol=1e-12, rtol=0)
+        assert torch.equal(frame[..., 2], axis)
+        # The first lies in the plane of the axis and x (of y, where the axis is nearly x), on its side.
+        reference = torch.where(
+            axis[:, :1].abs() > 0.9, torch.eye(3, dtype=F64)[1], torch.eye(3, dtype=F64)[0]
+        )
+        assert_close((frame[..., 1] * reference).sum(-1), torch.zeros(50, dtype=F64), atol=1e-12, rtol=0)
+        assert ((frame[..., 0] * reference).sum(-1) > 0).all()
+
+    def test_of_a_trunk_and_a_foot(self) -> None:
+        """Up: width, then depth. To the front: width, then height."""
+        x, y, z = torch.eye(3, dtype=F64)
+        assert_close(frame_along(-y), torch.stack([x, z, -y], -1))
+        assert_close(frame_along(-z), torch.stack([x, -y, -z], -1))
+        assert_close(frame_along(x), torch.stack([y, z, x], -1))
+
+
 class TestEllipsoidMatrix:
     def test_is_two_on_the_surface(self, body: BodyModel) -> None:
         posed = body(random_pose(body, 3), random_size(body, 3))
@@ -389,6 +411,36 @@ class TestEllipsoidMatrix:
             form = (X @ A * X).sum(-1)
             assert_close(form, torch.full_like(form, value), atol=1e-9, rtol=0)
         assert_close(A, A.mT, atol=1e-9, rtol=0)
+
+
+class TestTwoRadii:
+    def test_stand_along_the_first_axes_and_mirror(self, tmp_path: Path) -> None:
+        """A flat hand on both sides, of a slanted arm: the mirrored body is the same set of points."""
+        data = yaml.safe_load(HUMAN.read_text())
+        data["segments"]["hand"] |= {"radius": {"forearm_girth": [0.05, 0.02]}, "axis": [-0.4, 1, 0.3]}
+        file = tmp_path / "flat.yaml"
+        file.write_text(yaml.safe_dump(data, sort_keys=False))
+        body = BodyModel(BodyConfig(str(file))).double()
+        posed = body(torch.zeros(1, 24, dtype=F64), 1.25 * body.default_size(1))
+        left, right = (body.segment_names.index(f"hand_{side}") for side in ("left", "right"))
+        expected = 1.25 * torch.tensor(
+            [0.05, 0.02, data["segments"]["hand"]["half_length"]["forearm"]], dtype=F64
+        )
+        assert_close(posed.radii[0, left], expected, atol=1e-8, rtol=0)
+        assert torch.equal(posed.radii[0, left], posed.radii[0, right])
+        mirror = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=F64))
+        A = ellipsoid_matrix(posed)[0]
+        # Constants are rounded to single precision.
+        assert_close(mirror @ A[left] @ mirror, A[right], atol=1e-4, rtol=1e-6)
+        assert (posed.frames[0, left, 0, 0]).item() > 0.5
+
+    def test_a_long_axis_stays_the_longest(self) -> None:
+        body = BodyModel().double()
+        size = body.default_size(1)
+        size[:, body.num_lengths :] = 9.0
+        radii = body(torch.zeros(1, 24, dtype=F64), size).radii
+        assert torch.equal(radii[..., 2], radii.amax(-1))
+        assert (radii[..., 2] == radii[..., :2].amax(-1)).any()
 
 
 class TestOwnBodyFile:

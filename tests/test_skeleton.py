@@ -98,7 +98,13 @@ class TestHuman:
         assert origin["forearm_left"][1] > 0
         assert origin["shank_left"][1] > 0
         for segment in human.segments:
-            assert 0 < min(segment.radius[1]) <= max(segment.radius[1]) <= segment.half_length[1] < human.height / 2
+            assert (
+                0
+                < min(segment.radius[1])
+                <= max(segment.radius[1])
+                <= segment.half_length[1]
+                < human.height / 2
+            )
 
     def test_axes_and_directions_are_unit_vectors(self, human: Skeleton) -> None:
         for body in human.bodies:
@@ -191,6 +197,15 @@ class TestOtherFiles:
 
         head = load_skeleton(write(tmp_path, both)).bodies[0]
         assert head.origin.default() == (0, -0.75, 0.125)
+
+    def test_one_radius_or_two(self, tmp_path: Path) -> None:
+        def flat(data: Body) -> None:
+            data["segments"]["foot"]["radius"] = {"shank_girth": 0.05}
+            data["segments"]["torso"]["radius"] = {"trunk_girth": [0.2, 0.1]}
+
+        radius = {segment.name: segment.radius for segment in load_skeleton(write(tmp_path, flat)).segments}
+        assert radius["foot_left"] == radius["foot_right"] == ("shank_girth", (0.05, 0.05))
+        assert radius["torso"] == ("trunk_girth", (0.2, 0.1))
 
     def test_swing_axes_are_straightened_to_their_center(self, tmp_path: Path) -> None:
         def skew(data: Body) -> None:
@@ -288,6 +303,26 @@ COMPLAINTS: list[tuple[Change, str]] = [
     (
         put({"forearm_girth": 0.1, "head_girth": 1}, "segments", "hand", "radius"),
         "segment hand: .* must come with",
+    ),
+    (
+        put({"forearm_girth": []}, "segments", "hand", "radius"),
+        "segment hand: .* positive value in metres, got .*\\[\\]",
+    ),
+    (
+        put({"forearm_girth": [0.04, 0]}, "segments", "hand", "radius"),
+        "segment hand: .* positive value in metres, got .*\\[0.04, 0\\]",
+    ),
+    (
+        put({"forearm_girth": [0.04, 0.03, 0.02]}, "segments", "hand", "radius"),
+        "segment hand: radius must be one number or two, across the long axis, got .*0.02",
+    ),
+    (
+        put({"forearm_girth": [0.04, 0.4]}, "segments", "hand", "radius"),
+        "segment hand: half_length must be at least the radius",
+    ),
+    (
+        put({"forearm": [0.1, 0.1]}, "segments", "hand", "half_length"),
+        "segment hand: half_length must be one number",
     ),
     (put(0.04, "segments", "hand", "radius"), "segment hand: one of .* must come with .* got 0.04"),
     (

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchpose.body.model import PosedBody
 
-# With one differentiable step after them. Measured against bisection on 1.2 million pairs that are hard on purpose, half
-# axes 1 : 1 to 30 : 30: 2 of them are off by more than 1e-12 m in double; single precision is exact to its rounding.
+# With one differentiable step after them. Measured against bisection on 1.2 million pairs that are hard on purpose
+# (half axes up to 1 : 30 : 30): two are off by more than 1e-12 m in double; in single all are exact to rounding.
 NEWTON_STEPS = 5
 
 
@@ -62,29 +62,42 @@ def _nearest(
 ) -> Float[Tensor, "batch parts axes num"]:
     """The nearest point of an ellipse (two axes) or an ellipsoid (three) to each point, in the frame of its axes.
 
-    With the shortest half axis m, d = (r / m)^2 - 1 and p = x r / m^2 of each axis the point's coordinates over r are
-    p / (d + s), where s > 0 solves N(s) = |p / (d + s)|^2 = 1. Newton runs on 1/sqrt(N) - 1, concave and rising (a power
-    mean of lines), from a lower bound of the root. The last step is differentiable, which makes gradients exact.
+    It is x / (1 + t / r^2) in each axis, for the t that puts it on the surface: with the shortest half axis m,
+    s = 1 + t / m^2, d = (r / m)^2 - 1 and p = x r / m^2, its coordinates over r are p / (d + s), and s > 0 solves
+    N(s) = |p / (d + s)|^2 = 1. Newton runs on 1/sqrt(N) - 1, concave and rising (a power mean of lines), from a lower
+    bound of the root. The last step is differentiable, which makes gradients exact.
     """
+    p, d = _scaled(local, radii)
+    with torch.no_grad():
+        s = _lower_bound(p, d)
+        inverse, square = torch.empty_like(p), torch.empty_like(p)
+        for _ in range(NEWTON_STEPS):  # as `_newton`, without new memory
+            torch.add(d, s, out=inverse).reciprocal_()
+            torch.mul(p, inverse, out=square).square_()
+            N = square.sum(-2, keepdim=True)
+            s = torch.addcdiv(s, N * (N.sqrt() - 1), square.mul_(inverse).sum(-2, keepdim=True))
+    return _foot(_newton(s, p, d), p, d, radii)
+
+
+def _scaled(local: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
+    """p and d of `_nearest`."""
     shortest, index = radii.detach().min(-2, keepdim=True)
     # Keeps the solver off its pole. A point in the plane across the shortest axis moves by 1e-7 of the radius
     # (float32), its distance to the foot, which is stationary, by the square of that.
     least = torch.zeros_like(radii).scatter(-2, index, torch.finfo(radii.dtype).eps * shortest)
     with torch.no_grad():
         aside = (least - local.abs()).clamp_min_(0).copysign_(local)
-    d, p = (radii / shortest) ** 2 - 1, (local + aside) * (radii / shortest**2)
-    with torch.no_grad():
-        s = _lower_bound(p, d)
-        inverse, square = torch.empty_like(p), torch.empty_like(p)
-        for _ in range(NEWTON_STEPS):
-            torch.add(d, s, out=inverse).reciprocal_()
-            torch.mul(p, inverse, out=square).square_()
-            N = square.sum(-2, keepdim=True)
-            s = torch.addcdiv(s, N * (N.sqrt() - 1), square.mul_(inverse).sum(-2, keepdim=True))
+    return (local + aside) * (radii / shortest**2), (radii / shortest) ** 2 - 1
+
+
+def _newton(s: Tensor, p: Tensor, d: Tensor) -> Tensor:
     inverse = (d + s).reciprocal()
     square = (p * inverse) ** 2
     N = square.sum(-2, keepdim=True)
-    s = torch.addcdiv(s, N * (N.sqrt() - 1), (square * inverse).sum(-2, keepdim=True))
+    return torch.addcdiv(s, N * (N.sqrt() - 1), (square * inverse).sum(-2, keepdim=True))
+
+
+def _foot(s: Tensor, p: Tensor, d: Tensor, radii: Tensor) -> Tensor:
     unit = p / (d + s)
     # Rounding in s leaves the point off the surface by its relative error; one scaling puts it back on.
     return unit * (torch.rsqrt((unit * unit).sum(-2, keepdim=True)) * radii)
@@ -95,8 +108,8 @@ def _lower_bound(
 ) -> Float[Tensor, "batch parts 1 num"]:
     """A lower bound of the root s of |p / (d + s)|^2 = 1 from which few Newton steps are left.
 
-    Each axis alone gives one. Newton creeps from there where the pole of the shortest axis, s = 0, is close and what the
-    longer axes contribute, Q(s), is nearly 1. Let axes with d up to a few s be close ones, whose sum is at least
+    Each axis alone gives one. Newton creeps from there where the pole of the shortest axis, s = 0, is close and what
+    the longer axes contribute, Q(s), is nearly 1. Let axes with d up to a few s be close ones, whose sum is at least
     c / s^2 from here on. Q is convex, so 1 - Q(s) <= k + g s, a tangent: c <= s^2 (k + g s).
     """
     tiny = torch.finfo(p.dtype).tiny
@@ -113,6 +126,33 @@ def _lower_bound(
     return torch.maximum(torch.maximum(s, (c / torch.addcmul(short, g, most)).sqrt()), -k / g)
 
 
+def _across(
+    local: Float[Tensor, "num 3"], radii: Float[Tensor, "num 3"]
+) -> tuple[Float[Tensor, "num 3"], Bool[Tensor, " num"]]:
+    """The second nearest point, on the other side across the shortest axis of each ellipsoid; and if there is one.
+
+    Beside the nearest point a flat ellipsoid can have one more that is nearer than all its neighbours, for points
+    near the plane across its shortest axis: the root of N(s) next to the pole s = 0 from below. There Newton's
+    function is concave, too, and |p0 / s|^2 = 1 - Q(s) <= 1 - Q(0) bounds s, Q being what the longer axes give.
+    """
+    half_axes = radii.mT
+    p, d = _scaled(local.mT, half_axes)
+    with torch.no_grad():
+        close = d <= 0
+        Q = torch.where(close, 0.0, p / d).square().sum(-2, keepdim=True)
+        pole = torch.where(close, p, 0.0).square().sum(-2, keepdim=True)
+        edge = torch.where(close, torch.inf, d).amin(-2, keepdim=True)
+        s = -(pole / (1 - Q)).sqrt()
+        for _ in range(NEWTON_STEPS):
+            s = _newton(s, p, d)
+        unit = p / (d + s)
+        slope = (unit.square() / (d + s)).sum(-2, keepdim=True)
+        solved = (unit.square().sum(-2, keepdim=True) - 1).abs() < 1e-3
+        found = solved & (s < 0) & (s > -edge) & (slope < 0)
+        s = torch.where(found, s, -edge / 2)  # anything finite: it has gradients
+    return _foot(_newton(s, p, d), p, d, half_axes).mT, found[0]
+
+
 def surface_normal(
     local: Float[Tensor, "batch parts num 3"], radii: Float[Tensor, "batch parts 3"]
 ) -> Float[Tensor, "batch parts num 3"]:
@@ -124,22 +164,40 @@ def surface_normal(
 def foot_point(posed: PosedBody, points: Float[Tensor, "batch num 3"], visible: bool = True) -> FootPoint:
     """The nearest point of every ellipsoid, or with `visible` the nearest one that the camera can see.
 
-    A point whose nearest one faces away from the camera cannot have come from there. Of the visible side the
-    rim is then nearest (off the long axis the distance to an ellipsoid has no second minimum), so the distance
-    stays continuous where points cross over; taking the hit of the point's ray instead would make it jump.
+    A point whose nearest one faces away from the camera cannot have come from there. Of the visible side either the
+    rim is then nearest, or the point across a flat ellipsoid (there is no third minimum), so the distance stays
+    continuous where points cross over; taking the hit of the point's ray instead would make it jump.
     """
     local = to_local(posed, points)
     nearest = nearest_point(local, posed.radii)
     camera = _camera(posed)
     beyond = (camera * camera).sum(-1, keepdim=True) > 1  # a camera inside an ellipsoid sees no rim
-    hidden = ((nearest @ (camera / posed.radii)[..., None])[..., 0] < 1) & beyond
+    toward = camera / posed.radii
+    hidden = ((nearest @ toward[..., None])[..., 0] < 1) & beyond
     if visible:
         rim = _rim(posed)
         # The rim is an ellipse, a slice of the ellipsoid of its two half axes.
         aside = rim.axes.mT @ (local - rim.center[:, :, None]).mT
-        onto = rim.axes @ _nearest(aside, rim.radii[..., None]) + rim.center[..., None]
-        nearest = torch.where(hidden[..., None], onto.mT, nearest)
+        onto = (rim.axes @ _nearest(aside, rim.radii[..., None]) + rim.center[..., None]).mT
+        nearest = torch.where(hidden[..., None], onto, nearest)
+        if (candidate := hidden & _near_middle(local, posed.radii)).any():
+            b, k, n = candidate.nonzero(as_tuple=True)
+            place = local[b, k, n]
+            across, found = _across(place, posed.radii[b, k])
+            better = found & ((across * toward[b, k]).sum(-1) >= 1)
+            better &= (place - across).square().sum(-1) < (place - onto[b, k, n]).square().sum(-1)
+            nearest = nearest.index_put((b[better], k[better], n[better]), across[better])
     return FootPoint(nearest, surface_normal(nearest, posed.radii), local - nearest, hidden)
+
+
+def _near_middle(
+    local: Float[Tensor, "batch parts num 3"], radii: Float[Tensor, "batch parts 3"]
+) -> Bool[Tensor, "batch parts num"]:
+    """Where `_across` can exist: points no further from the planes of symmetry than its centres of curvature are."""
+    square = radii.detach().square()
+    low, middle, _ = square.sort(-1).values.split(1, -1)
+    limit = torch.where(square > low, square - low, middle - low) / radii.detach()
+    return (local.detach().mT.abs() < limit[..., None]).all(-2)
 
 
 def _length(vector: Float[Tensor, "batch parts num 3"]) -> Float[Tensor, "batch parts num 1"]:

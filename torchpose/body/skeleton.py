@@ -243,9 +243,7 @@ def _expand(data: Any) -> Skeleton:
         with _reading(f"segment {name}"):
             radius, half_length = across(entry["radius"]), along(entry["half_length"])
             if max(radius[1]) > half_length[1]:
-                raise ValueError(
-                    f"half_length must be at least the radius, got {half_length} < {radius}"
-                )
+                raise ValueError(f"half_length must be at least the radius, got {half_length} < {radius}")
             for body in sides(entry):
                 side, center, axis = (
                     body.removeprefix(entry["body"]),
