@@ -110,6 +110,7 @@ class PoseConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     start: StartConfig = field(default_factory=StartConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    shape_sd: float = 0.05  # rad, by which a body that is not quite the person's misleads every joint, in all frames alike
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them
     height: float = 0.0  # m, of the person; 0 measures it
@@ -542,6 +543,10 @@ class StereoToPose(nn.Module):
         P = body.num_parameters
         pose = torch.cat([fit.pose for fit in fits]) if fits else self.size.new_zeros(0, P)
         covariance = torch.cat([fit.covariance for fit in fits]) if fits else self.size.new_zeros(0, P, P)
+        # Neither more points nor more frames take this away.
+        shape = torch.full((P,), self.config.shape_sd**2).to(pose)
+        shape[:3] = 0
+        covariance = covariance + torch.diag(shape)
         distance = torch.cat([fit.point_to_model for fit in fits]) if fits else self.size.new_zeros(0)
         posed = body(pose, self.size)
         return PoseSequence(
