@@ -55,7 +55,12 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "the thesis as written": (_THESIS,),
     "thesis, no Potts and geodesic": (_THESIS, f"{_R}.labelling.potts=0", f"{_R}.labelling.geodesic=0"),
     "thesis, sigma 0.10 to 0.03 m": (_THESIS, f"{_R}.sigma_first=0.1", f"{_R}.sigma_last=0.03"),
-    "  that, no geodesic": (_THESIS, f"{_R}.sigma_first=0.1", f"{_R}.sigma_last=0.03", f"{_R}.labelling.geodesic=0"),
+    "  that, no geodesic": (
+        _THESIS,
+        f"{_R}.sigma_first=0.1",
+        f"{_R}.sigma_last=0.03",
+        f"{_R}.labelling.geodesic=0",
+    ),
     "thesis + visible side": (_THESIS, f"{_R}.visible=true"),
     "thesis + robust, no part": (_THESIS, f"{_R}.robust_sd=0.05", f"{_R}.outlier=3"),
     "thesis + silhouette": (_THESIS, f"{_R}.rim.weight=1"),
@@ -289,8 +294,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--oracle", nargs="+", choices=ORACLES, default=[], help="stages that the truth replaces"
     )
     parser.add_argument("--frames", type=int, help="only the first frames of each recording")
-    parser.add_argument("--settings", choices=("default", "thesis"), default="default", help="of the registration")
-    parser.add_argument("--ablate", action="store_true", help="a row for each term that is switched off, or alone on")
+    parser.add_argument(
+        "--settings", choices=("default", "thesis"), default="default", help="of the registration"
+    )
+    parser.add_argument(
+        "--ablate", action="store_true", help="a row for each term that is switched off, or alone on"
+    )
     parser.add_argument("--only", help="only recordings whose name contains this")
     arguments = parser.parse_intermixed_args(argv)
     torch.set_num_threads(1)

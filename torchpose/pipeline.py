@@ -110,7 +110,9 @@ class PoseConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     start: StartConfig = field(default_factory=StartConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    shape_sd: float = 0.05  # rad, by which a body that is not quite the person's misleads every joint, in all frames alike
+    shape_sd: float = (
+        0.05  # rad, by which a body that is not quite the person's misleads every joint, in all frames alike
+    )
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them
     height: float = 0.0  # m, of the person; 0 measures it

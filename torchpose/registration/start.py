@@ -134,7 +134,9 @@ class Starter(nn.Module):
         return select(final, self._score(final).argmin())
 
     def _score(self, found: Registration) -> Float[Tensor, " starts"]:
-        return found.score.nan_to_num(nan=torch.inf) + self.config.back_penalty * self._turned_away(found.pose)
+        return found.score.nan_to_num(nan=torch.inf) + self.config.back_penalty * self._turned_away(
+            found.pose
+        )
 
     def hypotheses(
         self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
@@ -216,7 +218,9 @@ def select(registration: Registration, row: Tensor) -> Registration:
 
 def _each(prior: PosePrior | None, batch: int) -> PosePrior | None:
     """The same prior for every start."""
-    return None if prior is None else PosePrior(prior.mean.expand(batch, -1), prior.precision.expand(batch, -1))
+    return (
+        None if prior is None else PosePrior(prior.mean.expand(batch, -1), prior.precision.expand(batch, -1))
+    )
 
 
 def _directions(
