@@ -154,7 +154,7 @@ class Shape:
         gone = (self.value - self.start) / torch.tensor(3 * [CENTER_SD] + 3 * [AXIS_SD] + 3 * [RADIUS_SD])
         return (gone**2).sum()
 
-    def entries(self, size: Float[Tensor, "sizes"]) -> None:
+    def entries(self, size: Float[Tensor, " sizes"]) -> None:
         """Print them as entries of a body file."""
         value = (self.start + (self.value - self.start) * self.mask).detach()
         segments = {segment.name: segment for segment in self.body.skeleton.segments}
