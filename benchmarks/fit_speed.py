@@ -47,6 +47,7 @@ from torchpose.body.model import BodyModel
 from torchpose.least_squares import (
     Linearize,
     LMConfig,
+    NormalEquations,
     Solution,
     levenberg_marquardt,
     linearize_by_autograd,
@@ -423,7 +424,7 @@ def iteration(batch: int, points: int, repeats: int) -> Iteration:
     start = pose + 0.05
     there = body(start, size)
     sums = partial(equations_by_moments, body, size, rows, prior, config, there)
-    ways = {
+    ways: dict[str, NormalEquations] = {
         "moments": sums(),
         "rows": normal_equations(linearize_by_screws(body, size, rows, prior, config)),
         "autograd": normal_equations(linearize_by_autograd(pose_residual(body, size, rows, prior, config))),

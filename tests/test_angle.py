@@ -320,8 +320,8 @@ class TestAngleSd:
         sd = angle_sd(body, of, covariance[None], body.default_size(1))
         draws = of + torch.randn(20_000, 24, dtype=F64) @ torch.linalg.cholesky(covariance).T
         sampled = anatomical_angles(body, body(draws)).std(dim=0)
-        # 20000 draws know a standard deviation to 0.5 %, three times that for the worst of 21.
-        assert_close(sd[0], sampled, rtol=0.02, atol=0)
+        # Ours come from 256 draws, in pairs and evenly spread.
+        assert_close(sd[0], sampled, rtol=0.15, atol=0)
 
     def test_a_straight_elbow_does_not_tell_the_shoulders_rotation(self, body: BodyModel) -> None:
         covariance = (0.05**2 * torch.eye(24, dtype=F64))[None]
@@ -335,11 +335,11 @@ class TestAngleSd:
             assert sd["shoulder_flexion_left"] < 0.1  # the upper arm itself is as well known as ever
             return sd["shoulder_rotation_left"]
 
-        at = [rotation(bend) for bend in (90, 30, 5, 1, 0)]
+        at = [rotation(bend) for bend in (90, 30, 10, 5, 0)]
         assert at == sorted(at)
         assert at[0] < 0.1
-        assert at[2] > 0.4
-        assert at[-1] == pytest.approx(math.pi)  # nothing known
+        assert at[3] > 0.4
+        assert at[-1] > 1.2  # next to nothing known
 
     def test_all_are_finite_in_the_zero_pose(self, body: BodyModel) -> None:
         sd = angle_sd(
@@ -353,13 +353,14 @@ class TestAngleSd:
             (1, 24, 24), torch.inf, dtype=F64
         )  # as the registration says when it cannot tell
         assert_close(
-            angle_sd(body, of, covariance, body.default_size(1)), torch.full((1, 21), math.pi, dtype=F64)
+            angle_sd(body, of, covariance, body.default_size(1)),
+            torch.full((1, 21), math.pi / 3**0.5, dtype=F64),
         )
 
     def test_batch_equals_one_by_one(self, body: BodyModel) -> None:
         of = torch.cat([pose(body, {"yaw": yaw}, **self.BENT) for yaw in (0, 30)])
         covariance = torch.stack([scale * torch.eye(24, dtype=F64) for scale in (1e-4, 4e-4)])
         both = angle_sd(body, of, covariance, body.default_size(1))
-        assert_close(both[1] / both[0], torch.full((21,), 2.0, dtype=F64), atol=1e-9, rtol=0)
+        assert_close(both[1] / both[0], torch.full((21,), 2.0, dtype=F64), atol=2e-3, rtol=0)
         alone = angle_sd(body, of[1:], covariance[1:], body.default_size(1))
         assert_close(both[1:], alone, atol=1e-14, rtol=0)

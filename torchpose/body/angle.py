@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.geometry import angle_between
 
-DRAWS = 32  # pairs of poses for the standard deviations of the angles
+DRAWS = 128  # pairs of poses for the standard deviations of the angles
 SIDES = ("left", "right")
 LIMB_ANGLE_NAMES = tuple(
     f"{joint}_{side}_limb" for joint in ("elbow", "knee", "shoulder", "hip") for side in SIDES
@@ -116,10 +116,11 @@ def angle_sd(
 ) -> Float[Tensor, "batch angles"]:
     """Standard deviations of the anatomical angles about those of `pose`, rad, from the pose's covariance.
 
-    By draws from the pose's Gaussian (the same for every frame, in pairs of opposite ones), not by derivatives: the rotation
-    of a limb that is almost straight, and the flexion of an arm held out to the side, may be any within the uncertainty of
-    the limb's direction, which a derivative at one direction does not see. Differences go round the circle, so that an angle
-    of which nothing is known has pi / sqrt(3). A covariance that is not finite gives that, too.
+    By draws from the pose's Gaussian (the same for every frame, in pairs of opposite ones), not by derivatives: the
+    rotation of a limb that is almost straight, and the flexion of an arm held out to the side, may be any within the
+    uncertainty of the limb's direction, which a derivative at one direction does not see. Differences go round the
+    circle, so that an angle of which nothing is known has pi / sqrt(3). A covariance that is not finite gives that,
+    too.
     """
     even = torch.quasirandom.SobolEngine(pose.shape[1], scramble=True, seed=0).draw(DRAWS).to(pose)
     normal = torch.special.ndtri(even.clamp(1e-4, 1 - 1e-4))

@@ -55,7 +55,7 @@ class StartConfig:
     face_yaws: tuple[float, ...] = (-75.0, -35.0, 0.0, 35.0, 75.0)  # degrees, tried when a face is seen
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
-    back_penalty: float = 8.0  # nats that a pose turned away from the camera must make good
+    back_penalty: float = 4.0  # nats that a pose turned away from the camera must make good
 
     def __post_init__(self) -> None:
         for name in ("points", "rounds", "final_rounds", "finalists"):

@@ -38,7 +38,7 @@ class TrackingConfig:
     velocity: float = 0.8  # share of the last velocity that the prediction keeps; 0 starts from the last pose
     joint_speed_sd: float = 8.0  # rad/s by which a joint departs from the prediction
     root_speed_sd: float = 2.0  # m/s and rad/s, the same for the root
-    accept_misfit: float = 0.055  # m: a pose that fits worse is none
+    accept_misfit: float = 0.060  # m: a pose that fits worse is none
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
