@@ -14,7 +14,8 @@ from torch import Tensor
 from torchpose.body.model import PosedBody
 
 # With one differentiable step after them. Measured against bisection on 1.2 million pairs that are hard on purpose
-# (half axes up to 1 : 30 : 30): two are off by more than 1e-12 m in double, the worst by 1.7e-6 m; in single a hundred by as much.
+# (half axes up to 1 : 30 : 30): two are off by more than 1e-12 m in double, the worst by 1.7e-6 m; in single precision
+# about a hundred are off by up to that much.
 NEWTON_STEPS = 5
 
 
