@@ -4,7 +4,8 @@ python -m benchmarks.people ../shared/data/people [--json FILE] [--oracle STAGE 
     [--frames N] [--only NAME] [key=value ...]
 
 Limb angles (degrees) and joints (mm) follow DESIGN.md's definitions on both sides; `within` is the share of
-the twelve limb joints within 10 cm, `unanswered` the share of frames without a pose. Errors are over the
+the twelve limb joints within 10 cm, `covered` the share of the limbs' anatomical angles whose truth lies within two of
+our standard deviations, `unanswered` the share of frames without a pose. Errors are over the
 answered frames. Times are CPU milliseconds a frame on one thread. An oracle puts the truth in the place of one
 stage, which tells what that stage costs: `disparity` the true depth, `mask` the true silhouette, `labels` the
 true body parts, `start` the true pose before the first frame, `size` the true lengths of the limbs. `--ablate` runs
@@ -25,7 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.body.angle import limb_angles
+from torchpose.body.angle import anatomical_angles, limb_angles
 from torchpose.body.model import BodyModel
 from torchpose.cli import InferConfig, load_config
 from torchpose.pipeline import Eyes, FramePose, Sight, SmoothingWindow, StereoToPose
@@ -272,7 +273,14 @@ def measure(
         (limb_angles(ours) - limb_angles(torch.cat([torch.zeros_like(true[:, :3]), true], 1))).abs().rad2deg()
     )
     figures = {f"{kind}_deg": float(error[:, 2 * i : 2 * i + 2].mean()) for i, kind in enumerate(KINDS)}
+    true_poses = torch.cat([true_pose(model.body, truth, int(i)) for i in index[answered]])
+    true_angles = anatomical_angles(model.body, model.body(true_poses, true_size(model.body, truth)))
+    off = (sequence.angles[answered] - true_angles + torch.pi).remainder(2 * torch.pi) - torch.pi
+    # The truth's trunk and neck are other points than ours: the limbs' angles alone.
+    limbs = [i for i, name in enumerate(sequence.angle_names) if not name.startswith(("trunk", "neck"))]
+    covered = off.abs()[:, limbs] < 2 * sequence.angle_sd[answered][:, limbs]
     figures |= {
+        "covered": float(covered.float().mean()),
         "angle_deg": float(error.mean()),
         "joint_mm": float(1000 * gap.mean()),
         "within": float((gap < 0.1).float().mean()),
@@ -368,7 +376,9 @@ def _row(name: str, figures: dict) -> str:
 
 
 def _digits(column: str) -> int:
-    return 3 if column in ("within", "unanswered") else 1 if column.endswith(("_deg", "_mm")) else 0
+    return (
+        3 if column in ("within", "unanswered", "covered") else 1 if column.endswith(("_deg", "_mm")) else 0
+    )
 
 
 if __name__ == "__main__":

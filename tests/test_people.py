@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.people import LIMB_JOINTS, Truth, measure, true_pose, true_size
+from benchmarks.people import ABLATIONS, LIMB_JOINTS, Truth, measure, true_pose, true_size
 from torchpose.body.angle import limb_angles
 from torchpose.body.model import BodyModel
 from torchpose.cli import load_config
@@ -42,3 +42,9 @@ def test_a_real_recording_is_measured_within_the_first_issue_s_targets(
     assert figures["angle_deg"] < 12
     assert figures["joint_mm"] < 100
     assert figures["unanswered"] == 0
+
+
+def test_every_ablation_is_a_setting_of_its_own():
+    configs = [load_config("infer", settings).pose for settings in ABLATIONS.values()]
+    assert configs[0] == load_config("infer").pose
+    assert all(first != other for i, first in enumerate(configs) for other in configs[:i])

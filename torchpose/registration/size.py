@@ -110,7 +110,11 @@ def read_size(path: Path, body: BodyModel) -> Float[Tensor, "1 sizes"]:
         raise ValueError(
             f"{path} must hold the sizes {list(body.size_names)}, got {rows}; measure the person anew"
         )
-    wrong = {n: v for n, v in rows.items() if not isinstance(v, int | float) or not SMALLEST <= v <= LARGEST}
+    wrong = {
+        n: v
+        for n, v in rows.items()
+        if isinstance(v, bool) or not isinstance(v, int | float) or not SMALLEST <= v <= LARGEST
+    }
     if wrong:
         raise ValueError(f"sizes in {path} must lie between {SMALLEST} and {LARGEST}, got {wrong}")
     return torch.tensor([[float(rows[name]) for name in body.size_names]]).to(body.axes)
