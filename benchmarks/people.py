@@ -15,6 +15,7 @@ once. Settings are those of infer.py.
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -343,7 +344,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def ablate(
     folders: Sequence[Path], overrides: Sequence[str], frames: int | None
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Figures by setting and recording; every recording is looked at once. Printed as they come."""
+    """Figures by setting and recording; every recording is looked at once. Progress goes to the error stream."""
     table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in ABLATIONS}
     for folder in folders:
         recording = open_recording(folder)
@@ -351,7 +352,11 @@ def ablate(
         eyes = RememberingEyes(Eyes(recording.camera, config.eyes))
         for name, settings in ABLATIONS.items():
             own = load_config("infer", [*settings, *overrides])
-            table[name][folder.name] = measure(folder, own, (), frames, eyes)
+            row = table[name][folder.name] = measure(folder, own, (), frames, eyes)
+            told = (
+                f"{row['angle_deg']:.1f} degrees, {row['joint_mm']:.0f} mm, {row['within']:.3f} within 10 cm"
+            )
+            print(f"{folder.name}, {name}: {told}", file=sys.stderr, flush=True)
     short = [folder.name.removesuffix("_m2") for folder in folders]
     print(f"{'degrees':<34}" + " ".join(f"{name[:9]:>9}" for name in [*short, "overall", "mm", "within"]))
     for name, rows in table.items():
