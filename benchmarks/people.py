@@ -30,7 +30,8 @@ from torch import Tensor
 from torchpose.body.angle import anatomical_angles, limb_angles
 from torchpose.body.model import BodyModel
 from torchpose.cli import InferConfig, load_config
-from torchpose.pipeline import Eyes, FramePose, Sight, SmoothingWindow, StereoToPose
+from torchpose.eyes import Eyes, Sight
+from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
 from torchpose.recording import Backgrounds, Frame, Recording, open_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
 from torchpose.vision.points import sample_grid

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchpose.aligned import align_recording
 from torchpose.atomic import replacing
-from torchpose.pipeline import Eyes, EyesConfig
+from torchpose.eyes import Eyes, EyesConfig
 from torchpose.recording import Backgrounds, Frame, Recording, open_recording
 from torchpose.scaled import ScaledRecording
 from torchpose.video import VideoFile

@@ -35,7 +35,7 @@ from benchmarks.face import FaceScore, HaarAlone, by_angle, face_figures, score_
 from benchmarks.people import Truth
 from torchpose.atomic import replacing
 from torchpose.cli import InferConfig, load_config
-from torchpose.pipeline import Eyes
+from torchpose.eyes import Eyes
 from torchpose.recording import Backgrounds, Frame, Recording, open_recording
 from torchpose.vision.stereo import OpenCVMatcher
 

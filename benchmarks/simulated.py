@@ -32,8 +32,9 @@ from torchpose.body.model import BodyModel, PosedBody
 from torchpose.body.superquadric import DisplayModel, Person
 from torchpose.cli import InferConfig, load_config
 from torchpose.export import PoseSequence
+from torchpose.eyes import Eyes, EyesConfig, Sight
 from torchpose.geometry import angle_between
-from torchpose.pipeline import Eyes, EyesConfig, Sight, SmoothingWindow, StereoToPose
+from torchpose.pipeline import SmoothingWindow, StereoToPose
 from torchpose.recording import Frame, spread_positions
 from torchpose.synthesis.depth import MatchedFrame, MatcherNoise, Scene, cast_depth, spoil
 from torchpose.synthesis.motion import MotionConfig, lowest, perform, random_stream

@@ -40,7 +40,7 @@ from torch.nn import functional as F
 
 from torchpose.atomic import replacing
 from torchpose.calibration import read_calibration
-from torchpose.pipeline import EyesConfig
+from torchpose.eyes import EyesConfig
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.disparity import Disparity
 from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig

@@ -15,7 +15,8 @@ from clip_stand_in import BODY, DATABASE, Maker, tiny_maker
 from torchpose import clips
 from torchpose.activity.dataset import Fold
 from torchpose.clips import ClipMaker, DataConfig, build_database
-from torchpose.pipeline import EyesConfig, PoseConfig
+from torchpose.eyes import EyesConfig
+from torchpose.pipeline import PoseConfig
 from torchpose.registration.size import SizeConfig
 from torchpose.registration.start import StartConfig
 from torchpose.rendered import RenderedRecording

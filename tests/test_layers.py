@@ -59,7 +59,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
         *("export", "figures"),
-        *("pipeline", "session", "clips", "study", "cli"),
+        *("eyes", "pipeline", "session", "clips", "study", "cli"),
     ),
 }
 ORDER = [

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
-from torchpose.registration.start import StartConfig, Starter, pelvis_position, select
+from torchpose.registration.start import StartConfig, Starter, pelvis_position
 from torchpose.registration.vem import Registrar, RegistrationConfig
 from torchpose.vision.faces import Faces
 
@@ -170,11 +170,11 @@ def test_a_pose_turned_away_must_fit_better(body, starter):
     assert starter._score(replace(even, score=torch.tensor([torch.nan, 20.0]))).argmin() == 1
 
 
-def test_select_takes_one_row(body):
+def test_a_registration_gives_one_of_its_rows(body):
     view = see(body, standing(body), num=80)
     starts = torch.cat([standing(body), standing(body, yaw=0.3)])
     both = Registrar(body)(view.observation(), starts, body.default_size(1))
-    one = select(both, torch.tensor(1))
+    one = both.take(torch.tensor([1]))
     assert torch.equal(one.pose, both.pose[1:])
     assert torch.equal(one.bound, both.bound[:, 1:])
     assert torch.equal(one.belief, both.belief[1:])

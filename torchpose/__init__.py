@@ -6,8 +6,9 @@ from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_
 from torchpose.body.ellipsoid import algebraic_distance, foot_point, nearest_point
 from torchpose.body.model import BodyConfig, BodyModel, PosedBody
 from torchpose.export import PoseSequence, read_poses_csv, read_poses_npz
+from torchpose.eyes import Eyes, EyesConfig
 from torchpose.least_squares import LMConfig, levenberg_marquardt
-from torchpose.pipeline import Eyes, EyesConfig, PoseConfig, StereoToPose
+from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Frame, Recording, open_recording, write_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
 from torchpose.registration.vem import Observation, Registrar, RegistrationConfig

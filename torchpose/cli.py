@@ -19,7 +19,8 @@ from torchpose.activity.recognizer import RecognizerConfig
 from torchpose.aligned import AlignedRecording, align_recording
 from torchpose.capture import camera_numbers, capture_recording, open_cameras
 from torchpose.clips import ClipMaker, DataConfig, build_database
-from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
+from torchpose.eyes import EyesConfig
+from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
 from torchpose.scaled import at_most

@@ -27,7 +27,8 @@ from torchpose.activity.dataset import Clip, Fold
 from torchpose.activity.subspace import Crop, SilhouetteConfig, resize_silhouettes
 from torchpose.atomic import replacing
 from torchpose.body.angle import limb_angles
-from torchpose.pipeline import EyesConfig, PoseConfig, StereoToPose
+from torchpose.eyes import EyesConfig
+from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.rendered import RenderedRecording
 from torchpose.session import settings_of
 from torchpose.synthesis.database import DatabaseConfig, PlannedClip, plan_database

@@ -1,27 +1,21 @@
-"""The stages as one module: frames of a recording in, poses of a person out.
+"""The stages as one module: frames of a recording in, smoothed poses of a person out.
 
-`Eyes` turns a frame into points and evidence, `StereoToPose` turns a recording's frames into poses. Left-camera frame,
-metres and radians.
+Left-camera frame, metres and radians.
 """
 
-import math
-import time
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
-from kornia.color import rgb_to_grayscale
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, angle_sd, limb_angles
 from torchpose.body.model import BodyConfig, BodyModel
 from torchpose.export import PoseSequence
+from torchpose.eyes import Eyes, EyesConfig, Sight
 from torchpose.recording import (
-    Backgrounds,
     Frame,
     Recording,
     UnreadableFrame,
@@ -39,7 +33,7 @@ from torchpose.registration.likelihood import (
 )
 from torchpose.registration.silhouette import nearest_inside
 from torchpose.registration.size import SizeConfig, fit_size, read_size, stack_observations
-from torchpose.registration.start import StartConfig, Starter, select
+from torchpose.registration.start import StartConfig, Starter
 from torchpose.registration.vem import (
     Observation,
     Registrar,
@@ -49,55 +43,8 @@ from torchpose.registration.vem import (
 )
 from torchpose.tracking.smoother import Message, Smoother, SmoothingConfig
 from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
-from torchpose.vision.background import (
-    BackgroundConfig,
-    BackgroundModel,
-    DepthBackground,
-    DepthBackgroundConfig,
-    far_readings,
-)
 from torchpose.vision.camera import StereoCamera
-from torchpose.vision.disparity import bridge_gaps
-from torchpose.vision.empty_scene import EmptySceneConfig, learn_empty_scene
-from torchpose.vision.faces import FaceConfig, FaceDetector, FaceMemory, Faces
-from torchpose.vision.growing_seeds import GrowingSeeds
-from torchpose.vision.photometry import temporal_median
-from torchpose.vision.points import CellConfig, PointCloud, SamplingConfig, group_cells, sample_grid
-from torchpose.vision.scene_match import SceneMatch, SceneMatchConfig
-from torchpose.vision.silhouette import SilhouetteConfig, person_silhouette, search_region
-from torchpose.vision.skin import SkinModel
-from torchpose.vision.stereo import StereoConfig, stereo_matcher
-
-
-@dataclass(frozen=True)
-class EyesConfig:
-    """From images to points."""
-
-    nearest: float = 1.2  # m, of the person: with `farthest` it bounds the disparities that are searched
-    farthest: float = 8.0  # m
-    background_frames: int = 15  # of the recording, from which the empty scene is learned if none is given
-    background: BackgroundConfig = field(default_factory=BackgroundConfig)
-    empty_scene: EmptySceneConfig = field(default_factory=EmptySceneConfig)
-    depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
-    scene_match: SceneMatchConfig = field(default_factory=SceneMatchConfig)
-    silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
-    memory: float = 0.5  # s, for which the last frame's silhouette tells which part of this one is the person
-    stereo: StereoConfig = field(default_factory=StereoConfig)
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    face: FaceConfig = field(default_factory=FaceConfig)
-    range_scale: int = 4  # by which images are shrunk to find the person's range of disparities
-    glance_margin: float = 0.8  # m around it: an arm may be too thin for the small images
-    last_margin: float = 0.5  # m around the last frame's range
-    least_matched: float = 0.7  # share of the foreground; with less the range was wrong, and all is searched
-    min_points: int = 60  # fewer points on the person are nobody
-
-    def __post_init__(self) -> None:
-        if not 0 < self.nearest < self.farthest:
-            raise ValueError(
-                f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}"
-            )
-        if min(self.background_frames, self.min_points, self.range_scale) < 1:
-            raise ValueError("background_frames, min_points and range_scale must be at least 1")
+from torchpose.vision.points import CellConfig, group_cells
 
 
 @dataclass(frozen=True)
@@ -122,212 +69,6 @@ class PoseConfig:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What the eyes make of one frame, batch 1."""
-
-    images: Float[Tensor, "1 3 height width"]  # the left or the colour image; grey depth where there is none
-    depth: Float[Tensor, "1 height width"]  # m, NaN where unknown
-    silhouette: Bool[Tensor, "1 height width"]
-    cloud: PointCloud
-    faces: Faces
-    present: bool  # somebody is there
-    cut: bool  # the silhouette meets the image's border
-    coloured: bool = True  # False: `images` are a picture of the depth
-
-
-@dataclass(frozen=True)
-class LastSight:
-    """What the next frame is told of this one."""
-
-    time_s: float
-    silhouette: Bool[Tensor, "1 height width"]
-    disparity: Float[Tensor, "1 height width"] | None  # px, of the person alone; None: a depth camera
-    face: FaceMemory | None
-
-
-class Stopwatch:
-    """Processor time by stage, s."""
-
-    def __init__(self) -> None:
-        self.seconds: defaultdict[str, float] = defaultdict(float)
-
-    @contextmanager
-    def measure(self, stage: str) -> Iterator[None]:
-        begin = time.process_time()
-        yield
-        self.seconds[stage] += time.process_time() - begin
-
-
-class Eyes(nn.Module):
-    """Silhouette, depth, points and face of each frame of one recording."""
-
-    def __init__(self, camera: StereoCamera, config: EyesConfig = EyesConfig()):
-        super().__init__()
-        self.camera = camera
-        self.config = config
-        self.stereo = stereo_matcher(config.stereo)
-        # On a small copy the person is small, too, and holes do not matter.
-        island = max(1, config.stereo.gcs.min_island // config.range_scale**2)
-        self.glance = GrowingSeeds(replace(config.stereo.gcs, windows=(5,), min_island=island, fill=False))
-        self.find_faces = FaceDetector(config.face)
-        self.stopwatch = Stopwatch()
-        self.background: BackgroundModel | DepthBackground | None = None
-        self.background_depth: Tensor | None = None
-        self.scene_match: SceneMatch | None = None
-        self.last: LastSight | None = None
-
-    @property
-    def disparity_range(self) -> tuple[int, int]:
-        """Disparities that `nearest` to `farthest` allow, px."""
-        near, far = self.camera.disparity(torch.tensor([self.config.nearest, self.config.farthest])).tolist()
-        return math.floor(far), math.ceil(near)
-
-    def person_range(
-        self,
-        left: Float[Tensor, "1 3 height width"],
-        right: Float[Tensor, "1 3 height width"],
-        region: Bool[Tensor, "1 height width"],
-        last: Float[Tensor, "1 height width"] | None,
-    ) -> tuple[int, int]:
-        """Disparities to search in this frame, px: around the last frame's person, or around what a small copy shows.
-
-        The cost of matching is that of the disparities searched, and most of those that `nearest` and `farthest`
-        allow lie before and behind the person.
-        """
-        low, high = self.disparity_range
-        margin = self.config.last_margin
-        if last is None:
-            shrink, margin = self.config.range_scale, self.config.glance_margin
-            size = (left.shape[2] // shrink, left.shape[3] // shrink)
-            small = [torch.nn.functional.interpolate(image, size, mode="area") for image in (left, right)]
-            mask = torch.nn.functional.interpolate(region[:, None].to(left), size, mode="area")[:, 0] > 0
-            last = (
-                shrink * self.glance(*small, mask, disparity_range=(low // shrink, -(-high // shrink))).values
-            )
-        depth = self.camera.depth(last[last.isfinite()])
-        if len(depth) < self.config.min_points:
-            return low, high
-        near, far = (float(depth.quantile(share)) for share in (0.01, 0.99))
-        ends = self.camera.disparity(torch.tensor([far + margin, max(near - margin, self.config.nearest)]))
-        least, greatest = ends.tolist()
-        return max(low, math.floor(least)), min(high, math.ceil(greatest))
-
-    def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
-        """Learn the empty scene from its frames, or where there are none from the recording itself."""
-        spread = spread_positions(len(recording), self.config.background_frames)
-        if self.camera.baseline is None:
-            depth = backgrounds.depth
-            if depth is None:
-                depth = far_readings(_stack([frame.depth for frame in readable_frames(recording, spread)]))
-            self.background = DepthBackground(depth.to(device), self.config.depth_background)
-            self.background_depth = self.background.depth
-            return
-        if backgrounds.left is not None and backgrounds.right is not None:
-            left, right = backgrounds.left.to(device), backgrounds.right.to(device)
-            with self.stopwatch.measure("background"):
-                pair = left.median(0, keepdim=True).values, right.median(0, keepdim=True).values
-                disparity = self.stereo(*pair, disparity_range=(0, self.disparity_range[1])).values[0]
-        else:
-            frames = list(readable_frames(recording, spread))
-            left, right = (
-                _stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right")
-            )
-            with self.stopwatch.measure("background"):
-                scene = learn_empty_scene(
-                    left,
-                    right,
-                    self.stereo,
-                    self.camera,
-                    (0, self.disparity_range[1]),
-                    self.config.empty_scene,
-                )
-            left, right, disparity = scene.left, scene.right, scene.disparity
-        disparity = bridge_gaps(disparity)  # a bare wall and a glaring floor match nowhere but at their rims
-        self.background = BackgroundModel(left, self.config.background)
-        self.background_depth = self.camera.depth(disparity)
-        empty = rgb_to_grayscale(torch.stack([temporal_median(left), temporal_median(right)]))[:, 0]
-        self.scene_match = SceneMatch(empty[0], empty[1], disparity, self.config.scene_match)
-
-    def state(self) -> dict[str, Tensor]:
-        """What is remembered of the last frame, to go on from there; {} if there was none."""
-        if self.last is None:
-            return {}
-        time_s = torch.tensor(self.last.time_s, dtype=torch.float64)
-        state = {"time_s": time_s, "silhouette": self.last.silhouette}
-        if self.last.face is not None:
-            state |= {"face": self.last.face.box}
-            state |= {f"skin_{name}": value for name, value in vars(self.last.face.skin).items()}
-        return state if self.last.disparity is None else state | {"disparity": self.last.disparity}
-
-    def restore(self, state: dict[str, Tensor], device: torch.device) -> None:
-        """Take up what `state` gave."""
-        self.last = None
-        if state:
-            disparity, box = state.get("disparity"), state.get("face")
-            skin = {name[5:]: value.to(device) for name, value in state.items() if name.startswith("skin_")}
-            self.last = LastSight(
-                float(state["time_s"]),
-                state["silhouette"].to(device),
-                None if disparity is None else disparity.to(device),
-                None if box is None else FaceMemory(box.to(device), SkinModel(**skin)),
-            )
-
-    def forward(self, frame: Frame, device: torch.device) -> Sight:
-        """Look at one frame."""
-        if self.background is None:
-            raise ValueError(
-                "the background must be learned before a frame is looked at; call learn_background"
-            )
-        last = self.last if self.last and 0 < frame.time_s - self.last.time_s < self.config.memory else None
-        if frame.depth is not None:
-            depth = frame.depth[None].to(device)
-            images = frame.left[None].to(device) if frame.left is not None else depth_picture(depth)
-            grey = rgb_to_grayscale(images)[:, 0]
-            with self.stopwatch.measure("background"):
-                log_odds = self.background(depth)
-        else:
-            assert frame.left is not None
-            assert frame.right is not None
-            images, right = frame.left[None].to(device), frame.right[None].to(device)
-            with self.stopwatch.measure("background"):
-                assert self.scene_match is not None
-                log_odds = self.background(images)
-                region = search_region(log_odds, self.config.silhouette)
-                grey, grey_right = (rgb_to_grayscale(image)[:, 0] for image in (images, right))
-                log_odds = log_odds + self.scene_match(grey, grey_right, region)
-                region = search_region(log_odds, self.config.silhouette)
-            with self.stopwatch.measure("stereo"):
-                seeds = last.disparity if last else None
-                span = self.person_range(images, right, region, seeds)
-                disparity = self.stereo(images, right, region, seeds, span)
-                changed = log_odds > 0
-                share = float((disparity.values.isfinite() & changed).sum() / changed.sum().clamp_min(1))
-                if span != self.disparity_range and share < self.config.least_matched:
-                    disparity = self.stereo(images, right, region, None, self.disparity_range)
-                depth = self.camera.depth(disparity.values)
-        with self.stopwatch.measure("silhouette"):
-            silhouette = person_silhouette(
-                log_odds,
-                depth,
-                self.config.silhouette,
-                self.background_depth,
-                self.camera,
-                guide=grey,
-                previous=last.silhouette if last else None,
-            ).mask
-            seen = depth.where(silhouette, torch.nan)
-            matched = None if self.camera.baseline is None else self.camera.disparity(seen)
-        with self.stopwatch.measure("points"):
-            cloud = sample_grid(depth, silhouette, self.camera, self.config.sampling)
-        with self.stopwatch.measure("faces"):
-            faces = self.find_faces(images, silhouette, depth, self.camera, last.face if last else None)
-        self.last = LastSight(frame.time_s, silhouette, matched, faces.memory)
-        present = int(cloud.mask.sum()) >= self.config.min_points
-        cut = _touches_border(silhouette[0])
-        return Sight(images, depth, silhouette, cloud, faces, present, cut, frame.left is not None)
-
-
-@dataclass(frozen=True)
 class FramePose:
     """One frame's result: what was seen and what was fitted. `sight` is None where the frame could not be read."""
 
@@ -347,12 +88,12 @@ class StereoToPose(nn.Module):
     """
 
     def __init__(
-        self, camera: StereoCamera, eyes: EyesConfig = EyesConfig(), config: PoseConfig = PoseConfig()
+        self, camera: StereoCamera, eyes: EyesConfig | None = None, config: PoseConfig = PoseConfig()
     ):
         super().__init__()
         self.camera = camera
         self.config = config
-        self.eyes = Eyes(camera, eyes)
+        self.eyes = Eyes(camera, eyes or EyesConfig())
         self.body = BodyModel(config.body)
         names = self.body.segment_names
         self.likelihoods = nn.ModuleList(
@@ -511,7 +252,7 @@ class StereoToPose(nn.Module):
             )
         answer = list(frames)
         for row, i in enumerate(found):
-            answer[i] = replace(frames[i], registration=select(smooth.registration, torch.tensor(row)))
+            answer[i] = replace(frames[i], registration=smooth.registration.take(torch.tensor([row])))
         told = [row for row, i in enumerate(found) if i <= last % len(frames)]
         return answer, smooth.message(told[-1]) if told else before
 
@@ -609,24 +350,3 @@ def _upright_extent(sight: Sight) -> float:
     center = sight.faces.position[0, 0] if bool(sight.faces.found[0]) else middle[0]
     column = points[(points[:, 0] - center).abs() < 0.12, 1]  # raised hands are beside the head
     return float(torch.quantile(points[:, 1], 0.99) - torch.quantile(column, 0.01))
-
-
-def _touches_border(mask: Bool[Tensor, "height width"]) -> bool:
-    """Whether a few pixels of a mask lie on the image's edge; the sides of stereo's blind strip count as inside."""
-    edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    return int(edge.sum()) > 4
-
-
-def _stack(values: list[Tensor | None]) -> Tensor:
-    there = [value for value in values if value is not None]
-    if not there:
-        raise ValueError(
-            "the scene must be seen in at least one readable frame, got none; check the recording"
-        )
-    return torch.stack(there)
-
-
-def depth_picture(depth: Float[Tensor, "batch height width"]) -> Float[Tensor, "batch 3 height width"]:
-    """A picture of a depth image for people: near is bright."""
-    near = (1 / depth.clamp_min(0.5)).nan_to_num(0.0).clamp(0, 2) / 2
-    return near[:, None].expand(-1, 3, -1, -1)

@@ -33,8 +33,9 @@ from torchpose.export import (
     write_poses_npz,
     write_summary,
 )
+from torchpose.eyes import depth_picture
 from torchpose.figures import Overlay, draw_overlay, plot_angles
-from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose, depth_picture
+from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
 from torchpose.registration.size import write_size
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment

@@ -131,7 +131,7 @@ class Starter(nn.Module):
         final = self.registrar(
             observation, again.pose[best], size, _each(prior, len(best)), self.config.final_rounds
         )
-        return select(final, self._score(final).argmin())
+        return final.take(self._score(final).argmin()[None])
 
     def _score(self, found: Registration) -> Float[Tensor, " starts"]:
         return found.score.nan_to_num(nan=torch.inf) + self.config.back_penalty * self._turned_away(
@@ -205,15 +205,6 @@ def pelvis_position(
     x, z = torch.where(x.isfinite(), x, middle[:, 0]), torch.where(z.isfinite(), z, middle[:, 2])
     # The cloud is the body's front: the hips lie half a trunk's depth behind it.
     return torch.stack([x, y, z + 0.11], -1)
-
-
-def select(registration: Registration, row: Tensor) -> Registration:
-    """One row of a registration, as a batch of 1."""
-    picked = {name: getattr(registration, name) for name in Registration.__dataclass_fields__}
-    bound = picked.pop("bound")
-    return Registration(
-        **{name: value[row][None] for name, value in picked.items()}, bound=bound[:, row][:, None]
-    )
 
 
 def _each(prior: PosePrior | None, batch: int) -> PosePrior | None:

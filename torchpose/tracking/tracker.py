@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
-from torchpose.registration.start import Starter, select
+from torchpose.registration.start import Starter
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.vision.faces import Faces
 
@@ -197,7 +197,7 @@ class Tracker(nn.Module):
         both = self.registrar(
             observation, starts, size, PosePrior(prior.mean.repeat(2, 1), prior.precision.repeat(2, 1))
         )
-        return select(both, both.score.nan_to_num(nan=torch.inf).argmin())
+        return both.take(both.score.nan_to_num(nan=torch.inf).argmin()[None])
 
     def _stray(self, found: Registration) -> float:
         """Share of the points that are believed to be of no part."""
