@@ -1,6 +1,6 @@
 """Accuracy of the fit on simulated disparity: section 5.1 of the thesis, and the motions of its Tables 5.1 and 5.2.
 
-python -m benchmarks.simulated [--draws N] [--frames N] [--only MOTION] [--json FILE] [key=value ...]
+python -m benchmarks.simulated [--draws N] [--frames N] [--only MOTION] [--oracle LIST] [--json FILE] [key=value ...]
 
 People of super-quadrics (not the ellipsoids that are fitted), each recording with a person of its own, lengths and
 girths about +-10 %, stand 3 to 4 m (further, where raised hands would leave the image) before a camera of 640 x 480,
@@ -12,13 +12,16 @@ Limb angles are DESIGN.md's, of our joints and the true ones. `failed` counts an
 degrees off in direction or a limb joint more than 200 mm off, `unanswered` frames without a pose; `within` is the share
 of the twelve limb joints within 10 cm, `covered` the share of the anatomical angles within two of their standard
 deviations of the true body's. Errors are over the answered frames; `registration` is in CPU ms a frame on one thread.
+
+`--oracle` says what an error costs: `size` gives the true lengths and girths, `start` the true pose as every frame's
+start, `shape` draws the very ellipsoids that are fitted. They may be joined: `--oracle size,shape`.
 """
 
 import argparse
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,7 +39,7 @@ from torchpose.eyes import Eyes, EyesConfig, Sight
 from torchpose.geometry import angle_between
 from torchpose.pipeline import SmoothingWindow, StereoToPose
 from torchpose.recording import Frame, spread_positions
-from torchpose.synthesis.depth import MatchedFrame, MatcherNoise, Scene, cast_depth, spoil
+from torchpose.synthesis.depth import DepthFrames, MatchedFrame, MatcherNoise, Scene, cast_depth, spoil
 from torchpose.synthesis.motion import MotionConfig, lowest, perform, random_stream
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.faces import Faces
@@ -51,6 +54,7 @@ MOTIONS = {"arms": 110} | dict.fromkeys(
     ),
     60,
 )
+ORACLES = ("size", "start", "shape")
 KINDS = ("elbow", "knee", "shoulder", "hip")
 # Limbs by the contract's joints: upper arms, forearms, thighs, shanks.
 LIMBS = ((5, 3), (6, 4), (7, 5), (8, 6), (11, 9), (12, 10), (13, 11), (14, 12))
@@ -132,16 +136,39 @@ def place(
 
 
 @torch.no_grad()
+def cast_ellipsoids(posed: PosedBody, camera: StereoCamera, scene: Scene) -> DepthFrames:
+    """`cast_depth` of the ellipsoids that are fitted, in place of super-quadrics: a body without errors of shape."""
+    v, u = (torch.arange(n).to(posed.origins) for n in (camera.height, camera.width))
+    below = ((v - camera.cy) / camera.focal_length).clamp_min(scene.floor / scene.wall / 2)
+    empty = (scene.floor / below).clamp_max(scene.wall)[:, None].expand(-1, camera.width)
+    depth = empty.repeat(len(posed.origins), 1, 1)
+    labels = torch.zeros_like(depth, dtype=torch.long)
+    ray = camera.back_project(torch.cartesian_prod(v, u).flip(-1), torch.ones(len(v) * len(u)).to(v)).mT
+    for i in range(len(depth)):
+        for part in range(posed.radii.shape[1]):
+            # In units of the half axes a ray meets the unit sphere where a t^2 - 2 b t + c = 0.
+            to_unit = (posed.frames[i, part] / posed.radii[i, part]).mT
+            way, center = to_unit @ ray, to_unit @ posed.centers[i, part]
+            a, b, c = way.square().sum(0), center @ way, center.square().sum() - 1
+            reach = ((b - (b.square() - a * c).sqrt()) / a).view_as(depth[i])  # NaN where it misses
+            seen = reach < depth[i]
+            depth[i], labels[i] = reach.where(seen, depth[i]), labels[i].masked_fill(seen, part + 1)
+    return DepthFrames(depth, labels)
+
+
+@torch.no_grad()
 def simulate(
     motion: str,
     draw: int = 0,
     frames: int | None = None,
     sampling: SamplingConfig = SAMPLING,
     noise: MatcherNoise = NOISE,
+    true_shape: bool = False,
 ) -> Take:
     """A take of a motion by a new person, seen with errors. `draw` decides all, `frames` None is the motion's own.
 
-    Raises ValueError for an unknown motion or no frames.
+    With `true_shape` the ellipsoids that are fitted are drawn in place of super-quadrics. Raises ValueError for an
+    unknown motion or no frames.
     """
     if motion not in MOTIONS:
         raise ValueError(f"the motion must be one of {', '.join(MOTIONS)}, got {motion!r}")
@@ -160,7 +187,7 @@ def simulate(
     posed = body(pose, size)
     scene = Scene(float(lowest(body, posed).amax()), float(pose[:, 2].amax()) + 1.5)
     display = DisplayModel(body, person)
-    exact = cast_depth(display, posed, CAMERA, scene)
+    exact = cast_ellipsoids(posed, CAMERA, scene) if true_shape else cast_depth(display, posed, CAMERA, scene)
     matched = [spoil(exact.depth[i], exact.mask[i], CAMERA, generator, noise) for i in range(frames)]
     seen = face_boxes(body, display, posed, exact.depth, generator)
     sights = [look(one, box, sampling) for one, box in zip(matched, seen, strict=True)]
@@ -212,17 +239,22 @@ def look(matched: MatchedFrame, box: Float[Tensor, "4"], sampling: SamplingConfi
     return Sight(blank, depth, silhouette, cloud, faces, bool(cloud.mask.any()), bool(edge.any()), False)
 
 
-def follow(take: Take, config: InferConfig) -> tuple[PoseSequence, dict[str, float]]:
-    """The product's poses for a take, and CPU seconds by stage."""
+def follow(
+    take: Take, config: InferConfig, oracle: Collection[str] = ()
+) -> tuple[PoseSequence, dict[str, float]]:
+    """The product's poses for a take, and CPU seconds by stage. `oracle` may give it the true `size` and `start`."""
     model = StereoToPose(CAMERA, config.eyes, config.pose)
     model.eyes = SimulatedEyes(take, config.eyes)
     begin = time.process_time()
     spread = spread_positions(len(take.sights), config.pose.size_frames)
-    model.size = model.measure_size([take.sights[i] for i in spread])
+    model.size = take.size if "size" in oracle else model.measure_size([take.sights[i] for i in spread])
     seconds = {"size": time.process_time() - begin}
     window, poses = SmoothingWindow(model), []
     for i in range(len(take.sights)):
-        poses += window.push(model.follow(take.frame(i)))
+        frame = take.frame(i)
+        if "start" in oracle:
+            model.tracker.begin(take.pose[i : i + 1], frame.time_s)
+        poses += window.push(model.follow(frame))
     poses += window.flush()
     return model.sequence(poses), seconds | dict(model.stopwatch.seconds)
 
@@ -278,11 +310,13 @@ def score(take: Take, sequence: PoseSequence) -> dict[str, float]:
     return {name: float(value) for name, value in figures.items()}
 
 
-def measure(motion: str, draw: int, frames: int | None, config: InferConfig) -> dict[str, float]:
+def measure(
+    motion: str, draw: int, frames: int | None, config: InferConfig, oracle: Collection[str] = ()
+) -> dict[str, float]:
     """Figures of one simulated recording."""
-    take = simulate(motion, draw, frames, config.eyes.sampling)
+    take = simulate(motion, draw, frames, config.eyes.sampling, true_shape="shape" in oracle)
     torch.manual_seed(config.seed)
-    sequence, seconds = follow(take, config)
+    sequence, seconds = follow(take, config, oracle)
     times = {"registration_ms": 1000 * seconds["registration"] / len(take.sights)}
     return score(take, sequence) | times | {"size_ms": 1000 * seconds["size"]}
 
@@ -313,6 +347,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--frames", type=int, help="of each recording, instead of 110 for arms and 60 for others"
     )
     parser.add_argument("--only", help=f"only motions whose name contains this: {', '.join(MOTIONS)}")
+    parser.add_argument(
+        "--oracle", default="", help=f"what is given: some of {', '.join(ORACLES)}, with commas"
+    )
     parser.add_argument("--json", type=Path, help="also write the figures, draw by draw, to this file")
     arguments = parser.parse_intermixed_args(argv)
     torch.set_num_threads(1)
@@ -322,10 +359,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error(f"--only must be part of one of {', '.join(MOTIONS)}, got {arguments.only!r}")
     if arguments.draws < 1 or (arguments.frames is not None and arguments.frames < 1):
         parser.error(f"--draws and --frames must be at least 1, got {arguments.draws} and {arguments.frames}")
+    oracle = [name for name in arguments.oracle.split(",") if name]
+    if unknown := set(oracle) - set(ORACLES):
+        parser.error(f"--oracle takes some of {', '.join(ORACLES)}, got {', '.join(sorted(unknown))}")
     print(f"{'motion':<18}" + " ".join(f"{name:>{max(7, len(name))}}" for name in COLUMNS.values()))
     takes: list[dict] = []
     for motion in motions:
-        rows = [measure(motion, draw, arguments.frames, config) for draw in range(arguments.draws)]
+        rows = [measure(motion, draw, arguments.frames, config, oracle) for draw in range(arguments.draws)]
         takes += [{"motion": motion, "draw": draw, **row} for draw, row in enumerate(rows)]
         print(_line(motion, overall(rows)), flush=True)
     if len(motions) > 1:

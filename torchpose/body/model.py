@@ -20,6 +20,7 @@ from torchpose.geometry import axis_pair_angles, exp_rotation, rotation_and_left
 class JointKind(Enum):
     """How two degrees of freedom turn a limb: two parts of one rotation vector, or two hinges in a row."""
 
+    anatomical = "anatomical"  # each as the body file says: hinges at elbows and knees, swings elsewhere
     swing = "swing"
     revolute = "revolute"
 
@@ -27,7 +28,9 @@ class JointKind(Enum):
 @dataclass(frozen=True)
 class BodyConfig:
     path: str = ""  # a body file; empty for the built-in human.yaml
-    joint: JointKind = JointKind.swing  # the thesis has revolute, which is singular at every straight limb
+    joint: JointKind = (
+        JointKind.anatomical
+    )  # the thesis has revolute, which is singular at every straight limb
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class BodyModel(nn.Module):
     rest: Tensor  # (P - 6,) joint parameters of the rest pose
     limbs: Tensor  # (J, 3) direction of each limb in its own body
     centers: Tensor  # (J, 3) direction of each limb at zero, in the parent body
+    hinged: Tensor  # (J,) bool: two hinges in a row, the limb's own axis first, or a swing
     align: Tensor  # (J, 3, 3) brings `limbs` to `centers`: the body's rotation at zero
     # (S, 3 J + 3 K + 3 joints + 3 K): sizes times it are offsets in the parents' frames, centres and joints in
     # their bodies', and radii.
@@ -115,8 +119,14 @@ class BodyModel(nn.Module):
         chain = self.skeleton.chain()
         if tuple(chain.get_joint_parameter_names()) != self.parameter_names:
             raise AssertionError("pytorch-kinematics orders the parameters otherwise than the skeleton")
-        swing = self.config.joint is JointKind.swing
-        hinges: list[Hinges] = [body.swing if swing else body.revolute for body in self.skeleton.bodies]
+        kind, bodies = self.config.joint, self.skeleton.bodies
+        hinged = [
+            body.hinged if kind is JointKind.anatomical else kind is JointKind.revolute for body in bodies
+        ]
+        self.register_buffer("hinged", torch.tensor(hinged), persistent=False)
+        hinges: list[Hinges] = [
+            body.revolute if own else body.swing for body, own in zip(bodies, hinged, strict=True)
+        ]
         axes = torch.tensor([axis for hinge in hinges for axis in hinge.axes])
         limits = torch.tensor([limit for hinge in hinges for limit in hinge.limits])
         free = torch.full((6,), torch.inf)
@@ -240,18 +250,17 @@ class BodyModel(nn.Module):
         root = self.axes[3:6] * pose[:, 3:6, None]
         angles = pose[:, 6:].unflatten(1, (-1, 2))  # (B, J, 2)
         axes = self.axes[6:].unflatten(0, (-1, 2))  # (J, 2, 3)
-        turned = angles[..., None] * axes
-        if self.config.joint is JointKind.swing:
-            rotation, slope = rotation_and_left_jacobian(torch.cat([root, turned.sum(2)], 1))
-            local = rotation[:, 3:] @ self.align
-            across = (slope[:, 3:] @ axes.mT).mT  # (B, J, 2, 3)
-        else:
-            rotation = exp_rotation(torch.cat([root, turned.flatten(1, 2)], 1))
-            first, second = rotation[:, 3:].unflatten(1, (-1, 2)).unbind(2)
-            local = first @ second
-            across = torch.stack(
-                [axes[:, 0].expand_as(first[..., 0]), (first @ axes[:, 1, :, None])[..., 0]], 2
-            )
+        first, second = (angles[..., None] * axes).unbind(2)
+        # A swing is one turn about the sum, hinges are two turns in a row; the second turn of a swing is none.
+        hinged = self.hinged[:, None]
+        second_turn = torch.where(hinged, second, 0.0)
+        turned = torch.cat([root, first + second - second_turn, second_turn], 1)
+        rotation, slope = rotation_and_left_jacobian(turned)
+        one, two = rotation[:, 3:].split(len(self.hinged), 1)
+        local = one @ two @ self.align
+        both = (slope[:, 3 : 3 + len(self.hinged)] @ axes.mT).mT  # (B, J, 2, 3)
+        after = (one @ axes[:, 1, :, None])[..., 0]
+        across = torch.stack([both[:, :, 0], torch.where(hinged, after, both[:, :, 1])], 2)
         yaw, pitch, roll = rotation[:, :3].unbind(1)
         turned = yaw @ pitch
         eye = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(len(pose), 3, 3)
@@ -296,7 +305,7 @@ class BodyModel(nn.Module):
 
     def _hinge_angles(self, joint: int, toward: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 2"]:
         axes = self.axes[6 + 2 * joint : 8 + 2 * joint].to(toward)
-        if self.config.joint is JointKind.swing:
+        if not self.hinged[joint]:
             return rotation_between(self.centers[joint].to(toward).expand_as(toward), toward) @ axes.mT
         both = axis_pair_angles(
             axes.expand(len(toward), 2, 3), self.limbs[joint].to(toward).expand_as(toward), toward
@@ -310,7 +319,7 @@ class BodyModel(nn.Module):
 
     def _turn(self, joint: int, angles: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch 3 3"]:
         axes = self.axes[6 + 2 * joint : 8 + 2 * joint].to(angles)
-        if self.config.joint is JointKind.swing:
+        if not self.hinged[joint]:
             return exp_rotation(angles @ axes) @ self.align[joint].to(angles)
         return exp_rotation(angles[:, :1] * axes[0]) @ exp_rotation(angles[:, 1:] * axes[1])
 

@@ -58,6 +58,7 @@ class Body:
     rest: Vector
     swing: Hinges
     revolute: Hinges
+    hinged: bool  # as anatomy has it: the pair of hinges (a knee, an elbow), not the swing
 
 
 @dataclass(frozen=True)
@@ -213,10 +214,13 @@ def _expand(data: Any) -> Skeleton:
             origin, limb, rest = sized(entry["origin"]), _unit(entry["limb"]), _unit(entry["rest"])
             swing = _hinges(entry["swing"], _unit(entry["swing"]["center"]))
             revolute = _hinges(entry["revolute"])
+            kind = entry["anatomical"]
+            if kind not in ("swing", "revolute"):
+                raise ValueError(f"anatomical must be swing or revolute, got {kind!r}")
         if side == "_right":
             origin, limb, rest = origin.mirrored(), _mirror(limb), _mirror(rest)
             swing, revolute = _mirror_hinges(swing), _mirror_hinges(revolute)
-        bodies.append(Body(name + side, parent, origin, limb, rest, swing, revolute))
+        bodies.append(Body(name + side, parent, origin, limb, rest, swing, revolute, kind == "revolute"))
         names.append(name + side)
         reached.add(name)
         descend(name, len(names) - 1, side)

@@ -28,10 +28,10 @@ SMALLEST, LARGEST = 0.6, 1.5
 class SizeConfig:
     rounds: int = 5  # of labelling and joint fitting; 0 keeps the proportions of the body file
     lm_steps: int = 2  # per round
-    common_length_sd: float = 0.06  # of the factor that all lengths share
-    length_sd: float = 0.04  # of each length beside it
-    common_girth_sd: float = 0.10
-    girth_sd: float = 0.05
+    common_length_sd: float = 0.03  # of the factor that all lengths share
+    length_sd: float = 0.025  # of each length beside it
+    common_girth_sd: float = 0.03
+    girth_sd: float = 0.02
 
     def __post_init__(self) -> None:
         if self.rounds < 0 or self.lm_steps < 1:
