@@ -33,6 +33,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "clump",
         "colour_histogram",
         "mean_shift",
+        "trunk",
         "head",
         "skin",
         "faces",

@@ -157,7 +157,7 @@ def test_padding_starts_out_of_reach_and_batches():
 def test_bad_input_is_said():
     with pytest.raises(ValueError, match=r"at least 1 px wide and high, got \(0, 5\)"):
         shift_window(torch.ones(1, 9, 9), torch.tensor([[0, 0, 0, 5]]))
-    with pytest.raises(ValueError, match="bandwidth must be positive, got 0.0"):
+    with pytest.raises(ValueError, match=r"bandwidth must be positive, got 0\.0"):
         MeanShiftConfig(bandwidth=0.0)
     with pytest.raises(ValueError, match="steps must be at least 1, got 0"):
         MeanShiftConfig(steps=0)
