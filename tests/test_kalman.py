@@ -251,14 +251,14 @@ def test_steps_of_no_time_change_nothing():
         )
 
 
-def test_float32_stays_positive_definite_through_a_thousand_precise_measurements():
+def test_float32_stays_positive_definite_through_hundreds_of_precise_measurements():
     """Position known to 1 mm after a start of 10 m: the plain form (I - K H) P goes negative here."""
     move = torch.tensor([[1.0, 0.01], [0.0, 1.0]])
     spread = 1e-6 * torch.tensor([[1e-6 / 3, 1e-4 / 2], [1e-4 / 2, 1e-2]])
     belief = Gaussian(torch.zeros(2), 100 * torch.eye(2))
     exact = Gaussian(belief.mean.double(), belief.covariance.double())
     model, noise = torch.tensor([[1.0, 0.0]]), torch.tensor([[1e-6]])
-    for step in range(1000):
+    for step in range(300):
         value = torch.tensor([0.01 * step])
         belief = kalman_update(kalman_predict(belief, move, spread), value, model, noise).belief
         exact = kalman_update(
@@ -287,6 +287,7 @@ def test_a_bad_row_is_said_and_leaves_the_others_alone():
 
 def test_gradients_are_finite_differences():
     start, values, move, move_noise, model, noise = system(11)
+    values, noise, move, move_noise = values[:3], noise[:3], move[:2], move_noise[:2]
     values[1, 0] = torch.nan
 
     def answer(mean, cover, seen, move):

@@ -200,9 +200,15 @@ class LocationFilter:
         """
         time_s = self._times(location, time_s)
         again = location.known & (time_s == location.time_s)
-        followed = self.update(self.predict(location, time_s), seen)
-        begun = self.begin(seen, time_s)
         known = location.known
+        followed = begun = None
+        if bool(known.any()):
+            followed = self.update(self.predict(location, time_s), seen)
+        if not bool(known.all()):
+            begun = self.begin(seen, time_s)
+        followed, begun = followed or begun, begun or followed
+        assert followed is not None
+        assert begun is not None
         after = location.where(again, followed.location.where(known, begun.location))
         flags = []
         for name in FLAGS:
@@ -372,7 +378,9 @@ class LocationFilter:
         found = self._measure(location, seen, gate)
         wrong = self._apart(seen) & found.used.all(-1)
         head_worse = found.deviation[..., 0] >= found.deviation[..., 1]
-        kept = self._measure(location, _without(seen, wrong & head_worse, wrong & ~head_worse), gate)
+        kept = found
+        if bool(wrong.any()):
+            kept = self._measure(location, _without(seen, wrong & head_worse, wrong & ~head_worse), gate)
         head, body = kept.used[..., 0], kept.used[..., 3]
         # Of somebody unseen the distance tells nothing new.
         distance = torch.where(head | body, self._distance(seen), torch.nan)[..., None]
