@@ -4,23 +4,16 @@ An appearance term as (3.9), of which the thesis has two; this one learns in the
 RGB in [0, 1] on the way in.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from kornia.color import rgb_to_lab
 from torch import Tensor
 
 from torchpose.registration.likelihood import Evidence, PartLikelihood
+from torchpose.vision.colour_histogram import NUM_BINS, colour_bins
 
-BINS = (7, 12, 12)  # of lightness, of green to red and of blue to yellow
-LOW, HIGH = (
-    (0.0, -48.0, -48.0),
-    (100.0, 48.0, 48.0),
-)  # what the bins span in CIELAB; few clothes are more colourful
-CORNERS = ((0, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1))
 RARE = 1e-5  # share of the person's colours that any colour may have; what was hardly seen says nothing of any part
 
 
@@ -51,21 +44,14 @@ class ColourLikelihood(PartLikelihood):
 
     counts: Float[Tensor, "parts bins"]  # points seen; a sided pair's rows are equal
     other_side: Int[Tensor, " parts"]  # the part itself, where it has no other side
-    lowest: Float[Tensor, " 3"]  # CIELAB, of the first bin's middle
-    spacing: Float[Tensor, " 3"]  # CIELAB, from bin to bin
-    corners: Int[Tensor, "corners 3"]
 
     def __init__(self, segment_names: Sequence[str], config: ColourConfig = ColourConfig()):
         super().__init__(segment_names)
         self.config = config
-        low, high, last = torch.tensor(LOW), torch.tensor(HIGH), torch.tensor(BINS) - 1
         other = [self.segment_names.index(_other_side(name)) for name in self.segment_names]
         for name, value in {
-            "counts": torch.zeros(len(other), math.prod(BINS)),
+            "counts": torch.zeros(len(other), NUM_BINS),
             "other_side": torch.tensor(other),
-            "lowest": low,
-            "spacing": (high - low) / last,
-            "corners": torch.tensor(CORNERS),
         }.items():
             self.register_buffer(name, value, persistent=False)
 
@@ -76,7 +62,7 @@ class ColourLikelihood(PartLikelihood):
     def forward(self, evidence: Evidence) -> Float[Tensor, "batch num parts"]:
         """Log-potentials of the parts: 0 on padding and while nothing is learned, never below
         `strength` log `floor`."""
-        place, share = self._bins(evidence)
+        place, share = colour_bins(_colours(evidence))
         total = self.counts.sum(0)
         person = total / total.sum().clamp_min(1)
         mass = self.counts.sum(1, keepdim=True)
@@ -100,25 +86,12 @@ class ColourLikelihood(PartLikelihood):
             belief: of each label; those after the parts are left out.
             distance: of each point to the nearest part, m.
         """
-        place, share = self._bins(evidence)
+        place, share = colour_bins(_colours(evidence))
         sure = (distance < self.config.near) & evidence.cloud.mask
         weight = belief[:, : len(self.segment_names)] * sure[:, None]
         weight = (weight + weight[:, self.other_side]).transpose(0, 1).flatten(1)  # (parts, B N)
         spread = (weight[..., None] * share.flatten(0, 1)).flatten(1)
         self.counts.mul_(1 - 1 / self.config.memory).index_add_(1, place.flatten(), spread)
-
-    def _bins(
-        self, evidence: Evidence
-    ) -> tuple[Int[Tensor, "batch num corners"], Float[Tensor, "batch num corners"]]:
-        """The eight bins around each point's colour and the share of each."""
-        lab = rgb_to_lab(_colours(evidence).mT[..., None])[..., 0].mT  # (B, N, 3)
-        last = torch.tensor(BINS, device=lab.device) - 1
-        at = torch.minimum(((lab - self.lowest) / self.spacing).clamp_min(0), last)[..., None, :]
-        corner = torch.minimum(at.floor(), last - 1)
-        rest = at - corner
-        share = torch.where(self.corners.bool(), rest, 1 - rest).prod(-1)
-        lightness, red, yellow = (corner.long() + self.corners).unbind(-1)
-        return (lightness * BINS[1] + red) * BINS[2] + yellow, share
 
 
 def _colours(evidence: Evidence) -> Float[Tensor, "batch num 3"]:
