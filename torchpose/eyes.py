@@ -40,6 +40,9 @@ from torchpose.vision.scene_match import SceneMatch, SceneMatchConfig
 from torchpose.vision.silhouette import SilhouetteConfig, person_silhouette, search_region
 from torchpose.vision.skin import SkinModel
 from torchpose.vision.stereo import StereoConfig, stereo_matcher
+from torchpose.vision.windows import window_max
+
+NOBODY = -1e3  # log-odds of a pixel that has been given to somebody
 
 
 @dataclass(frozen=True)
@@ -63,14 +66,16 @@ class EyesConfig:
     last_margin: float = 0.5  # m around the last frame's range
     least_matched: float = 0.7  # share of the foreground; with less the range was wrong, and all is searched
     min_points: int = 60  # fewer points on the person are nobody
+    people: int = 4  # at the most; 1 takes the largest silhouette for the person and all else for nothing
+    beside: int = 3  # px around somebody that are nobody else's
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest < self.farthest:
             raise ValueError(
                 f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}"
             )
-        if min(self.background_frames, self.min_points, self.range_scale) < 1:
-            raise ValueError("background_frames, min_points and range_scale must be at least 1")
+        if min(self.background_frames, self.min_points, self.range_scale, self.people) < 1:
+            raise ValueError("background_frames, min_points, range_scale and people must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,16 @@ class Sight:
     present: bool  # somebody is there
     cut: bool  # the silhouette meets the image's border
     coloured: bool = True  # False: `images` are a picture of the depth
+
+
+@dataclass(frozen=True)
+class View:
+    """What the eyes make of one frame before people are told apart, batch 1."""
+
+    images: Float[Tensor, "1 3 height width"]  # as a `Sight` has them
+    depth: Float[Tensor, "1 height width"]  # m, NaN where unknown
+    silhouette: Bool[Tensor, "1 height width"]  # of everybody
+    coloured: bool
 
 
 @dataclass(frozen=True)
@@ -225,12 +240,27 @@ class Eyes(nn.Module):
             )
 
     def forward(self, frame: Frame, device: torch.device) -> Sight:
-        """Look at one frame."""
+        """Look at one frame, and at whom it shows as one person."""
+        memory = self.last.face if self.last and self._recent(frame.time_s) else None
+        view = self.look(frame, device, most=1)
+        sight = self.sight(view, view.silhouette, memory)
+        assert self.last is not None
+        self.last = replace(self.last, face=sight.faces.memory)
+        return sight
+
+    def _recent(self, time_s: float) -> bool:
+        return self.last is not None and 0 < time_s - self.last.time_s < self.config.memory
+
+    def look(self, frame: Frame, device: torch.device, most: int | None = None) -> View:
+        """Look at one frame: depth, and where anybody is, `most` people in it (None: as configured).
+
+        The next frame is told of it, but not of faces.
+        """
         if self.background is None:
             raise ValueError(
                 "the background must be learned before a frame is looked at; call learn_background"
             )
-        last = self.last if self.last and 0 < frame.time_s - self.last.time_s < self.config.memory else None
+        last = self.last if self._recent(frame.time_s) else None
         if frame.depth is not None:
             depth = frame.depth[None].to(device)
             images = frame.left[None].to(device) if frame.left is not None else depth_picture(depth)
@@ -258,25 +288,49 @@ class Eyes(nn.Module):
                     disparity = self.stereo(images, right, region, None, self.disparity_range)
                 depth = self.camera.depth(disparity.values)
         with self.stopwatch.measure("silhouette"):
-            silhouette = person_silhouette(
-                log_odds,
-                depth,
-                self.config.silhouette,
-                self.background_depth,
-                self.camera,
-                guide=grey,
-                previous=last.silhouette if last else None,
-            ).mask
+            silhouette = self._silhouette(
+                log_odds, depth, grey, last.silhouette if last else None, most or self.config.people
+            )
             seen = depth.where(silhouette, torch.nan)
             matched = None if self.camera.baseline is None else self.camera.disparity(seen)
+        self.last = LastSight(frame.time_s, silhouette, matched, None)
+        return View(images, depth, silhouette, frame.left is not None)
+
+    def _silhouette(
+        self,
+        log_odds: Float[Tensor, "1 height width"],
+        depth: Float[Tensor, "1 height width"],
+        grey: Float[Tensor, "1 height width"],
+        previous: Bool[Tensor, "1 height width"] | None,
+        most: int,
+    ) -> Bool[Tensor, "1 height width"]:
+        """One silhouette after another, each of what is left of the foreground, until there is too little of it."""
+        config = self.config.silhouette
+        everybody = torch.zeros_like(log_odds, dtype=torch.bool)
+        fewest = config.min_area * log_odds[0].numel()
+        for _ in range(most):
+            one = person_silhouette(
+                log_odds, depth, config, self.background_depth, self.camera, guide=grey, previous=previous
+            ).mask
+            if not bool(one.any()):
+                break
+            everybody = everybody | one
+            taken = window_max(one.to(log_odds), self.config.beside) > 0
+            log_odds = log_odds.masked_fill(taken, NOBODY)
+            if float((log_odds > 0).sum()) < fewest:
+                break
+            previous = None if previous is None else previous & ~taken
+        return everybody
+
+    def sight(self, view: View, silhouette: Bool[Tensor, "1 height width"], face: FaceMemory | None) -> Sight:
+        """Whom a silhouette shows, of a view's people; `face` is what his or her last sight remembers."""
         with self.stopwatch.measure("points"):
-            cloud = sample_grid(depth, silhouette, self.camera, self.config.sampling)
+            cloud = sample_grid(view.depth, silhouette, self.camera, self.config.sampling)
         with self.stopwatch.measure("faces"):
-            faces = self.find_faces(images, silhouette, depth, self.camera, last.face if last else None)
-        self.last = LastSight(frame.time_s, silhouette, matched, faces.memory)
+            faces = self.find_faces(view.images, silhouette, view.depth, self.camera, face)
         present = int(cloud.mask.sum()) >= self.config.min_points
         cut = _touches_border(silhouette[0])
-        return Sight(images, depth, silhouette, cloud, faces, present, cut, frame.left is not None)
+        return Sight(view.images, view.depth, silhouette, cloud, faces, present, cut, view.coloured)
 
 
 def _touches_border(mask: Bool[Tensor, "height width"]) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, angle_sd, limb_angles
@@ -119,8 +119,8 @@ class StereoToPose(nn.Module):
         """A sight as the likelihoods take it."""
         return Evidence(sight.images, sight.silhouette, sight.cloud, sight.faces)
 
-    def observe(self, sight: Sight) -> Observation:
-        """A sight as registration takes it."""
+    def observe(self, sight: Sight, covered: Bool[Tensor, "1 height width"] | None = None) -> Observation:
+        """A sight as registration takes it. `covered` is where something nearer may hide the person."""
         evidence = self.evidence(sight)
         potential = appearance_potential(self.likelihoods, evidence, self.body.num_parts)
         geodesic = None
@@ -128,7 +128,9 @@ class StereoToPose(nn.Module):
             cells = group_cells(sight.cloud, self.config.cells)
             bounds = geodesic_bounds(self.body, self.size)
             geodesic = geodesic_term(cells, bounds, outlier=self.config.registration.outlier > 0)
-        return Observation(sight.cloud, potential, nearest_inside(sight.silhouette), self.camera, geodesic)
+        # A limb may lie outside of the silhouette where something stands before it.
+        allowed = sight.silhouette if covered is None else sight.silhouette | covered
+        return Observation(sight.cloud, potential, nearest_inside(allowed), self.camera, geodesic)
 
     def learn_background(self, recording: Recording) -> None:
         """Learn the empty scene of the recording."""

@@ -5,7 +5,7 @@ metres.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -51,7 +51,15 @@ def stack_observations(observations: Sequence[Observation]) -> Observation:
     )
     potential = torch.cat([observation.potential for observation in observations])
     nearest = torch.cat([observation.nearest for observation in observations])
-    return Observation(cloud, potential, nearest, observations[0].camera)
+    terms = [observation.geodesic for observation in observations if observation.geodesic is not None]
+    geodesic = None
+    if len(terms) == len(observations):
+        geodesic = replace(
+            terms[0],
+            cell=torch.cat([term.cell for term in terms]),
+            distance=torch.cat([term.distance for term in terms]),
+        )
+    return Observation(cloud, potential, nearest, observations[0].camera, geodesic)
 
 
 def fit_size(

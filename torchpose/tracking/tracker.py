@@ -1,10 +1,11 @@
 """One person through a recording: prediction, registration, loss and recovery, frame after frame.
 
-Times are in seconds, poses in metres and radians. The next frame starts from the last (T. 3.2.2).
+Times are in seconds, poses in metres and radians. The next frame starts from the last (T. 3.2.2), and its root from
+where the person's location is believed to be (T. 4.3.1).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -14,8 +15,10 @@ from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
+from torchpose.registration.size import stack_observations
 from torchpose.registration.start import Starter
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
+from torchpose.tracking.kalman import Gaussian
 from torchpose.vision.faces import Faces
 
 
@@ -38,6 +41,7 @@ class TrackingConfig:
     velocity: float = 0.8  # share of the last velocity that the prediction keeps; 0 starts from the last pose
     joint_speed_sd: float = 8.0  # rad/s by which a joint departs from the prediction
     root_speed_sd: float = 2.0  # m/s and rad/s, the same for the root
+    root_gate: float = 3.0  # times that, beyond which the location says where the root is
     accept_misfit: float = 0.060  # m: a pose that fits worse is none
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
@@ -54,6 +58,7 @@ class TrackingConfig:
         for name in (
             "joint_speed_sd",
             "root_speed_sd",
+            "root_gate",
             "accept_misfit",
             "stray_distance",
             "stray_share",
@@ -72,6 +77,14 @@ class TrackedFrame:
 
     status: TrackStatus
     registration: Registration | None
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Where a person's next registration starts."""
+
+    starts: Float[Tensor, "2 parameters"]  # the prediction, and the last pose
+    prior: PosePrior  # batch 1, about the prediction
 
 
 class Tracker(nn.Module):
@@ -126,30 +139,66 @@ class Tracker(nn.Module):
         faces: Faces | None,
         size: Float[Tensor, "#batch sizes"],
         cut: bool = False,
+        root: Gaussian | None = None,
     ) -> TrackedFrame:
         """The person's pose at `time_s`.
 
         Args:
             observation: the frame, batch 1; None where nobody is seen.
             faces: of the same frame, for a cold start.
-            cut: the silhouette meets the image's border, so part of the person may lie outside.
+            cut: part of the person may lie outside the image, or behind something.
+            root: the middle of the hips as the person's location has it, m, batch 1; None where nothing is known.
         """
-        if self._pose is not None and time_s - self._time > self.config.memory:
+        return track_together([Person(self, time_s, observation, faces, size, cut, root)])[0]
+
+    def expect(self, time_s: float, root: Gaussian | None = None) -> Expected | None:
+        """Where the pose is at `time_s`, and how surely, as earlier frames and the location have it.
+
+        None where there is no last pose, or one that is too old.
+        """
+        if self._pose is None or time_s - self._time > self.config.memory:
+            return None
+        elapsed = max(time_s - self._time, 1e-3)
+        predicted = self._pose
+        if self._velocity is not None:
+            predicted = self._pose + self.config.velocity * elapsed * self._velocity
+        sd = torch.full_like(predicted, self.config.joint_speed_sd * elapsed)
+        sd[:, :6] = self.config.root_speed_sd * elapsed
+        precision = sd**-2
+        if root is not None and bool(root.mean.isfinite().all()):
+            place, own = root.mean.to(predicted), 1 / root.covariance.diagonal(dim1=-2, dim2=-1).to(predicted)
+            far = (place - predicted[:, :3]).abs() > self.config.root_gate * sd[:, :3]
+            # Where the two do not agree the person moved as the last poses did not foresee.
+            held = torch.where(far.any(1, keepdim=True), 0.0, precision[:, :3])
+            fused = (held * predicted[:, :3] + own * place) / (held + own)
+            predicted = torch.cat([fused, predicted[:, 3:]], 1)
+            precision = torch.cat([held + own, precision[:, 3:]], 1)
+        return Expected(torch.cat([predicted, self._pose]), PosePrior(predicted, precision))
+
+    def begin_frame(self, person: "Person") -> TrackedFrame | Expected:
+        """The answer where none needs a registration, or where to register from."""
+        if self._pose is not None and person.time_s - self._time > self.config.memory:
             self.forget()
-        if observation is None or faces is None:
+        if person.observation is None or person.faces is None:
             return TrackedFrame(TrackStatus.absent, None)
-        if self._pose is None:
-            if 0 <= time_s - self._failed < self.config.retry:
-                return TrackedFrame(TrackStatus.entering, None)
-            found = self.starter(observation, faces, size)
-            if not self.acceptable(found):
-                self._failed = time_s
-                return TrackedFrame(TrackStatus.entering, None)
-            self._remember(found, time_s)
-            return TrackedFrame(TrackStatus.partial if cut else TrackStatus.tracked, found)
-        status = TrackStatus.partial if cut else TrackStatus.tracked
-        predicted, prior = self._expect(time_s)
-        found = self._follow(observation, size, predicted, prior)
+        expected = self.expect(person.time_s, person.root)
+        if expected is not None:
+            return expected
+        if 0 <= person.time_s - self._failed < self.config.retry:
+            return TrackedFrame(TrackStatus.entering, None)
+        found = self.starter(person.observation, person.faces, person.size)
+        if not self.acceptable(found):
+            self._failed = person.time_s
+            return TrackedFrame(TrackStatus.entering, None)
+        self._remember(found, person.time_s)
+        return TrackedFrame(TrackStatus.partial if person.cut else TrackStatus.tracked, found)
+
+    def end_frame(self, person: "Person", found: Registration, prior: PosePrior) -> TrackedFrame:
+        """The answer, from a registration: limbs are sought elsewhere where need be, and all of it if that fails."""
+        assert person.observation is not None
+        assert person.faces is not None
+        time_s, observation, size = person.time_s, person.observation, person.size
+        status = TrackStatus.partial if person.cut else TrackStatus.tracked
         stray = self._stray(found)
         # Points that stayed without a part after a search (a bag, a skirt) are no reason for another one at once.
         strayed = stray > max(self.config.stray_share, 1.5 * self._known_stray)
@@ -164,7 +213,7 @@ class Tracker(nn.Module):
         else:
             self._known_stray = min(self._known_stray, stray)
         if not self.acceptable(found):
-            anew = self.starter(observation, faces, size)
+            anew = self.starter(observation, person.faces, size)
             if self.acceptable(anew):
                 found, status = anew, TrackStatus.recovered
                 self.forget()  # the way here from the last pose is a jump, no velocity
@@ -172,32 +221,6 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.lost, None)
         self._remember(found, time_s)
         return TrackedFrame(status, found)
-
-    def _expect(self, time_s: float) -> tuple[Float[Tensor, "1 parameters"], PosePrior]:
-        """Where the last frames say that the pose is now, and how surely."""
-        assert self._pose is not None
-        elapsed = max(time_s - self._time, 1e-3)
-        predicted = self._pose
-        if self._velocity is not None:
-            predicted = self._pose + self.config.velocity * elapsed * self._velocity
-        sd = torch.full_like(predicted, self.config.joint_speed_sd * elapsed)
-        sd[:, :6] = self.config.root_speed_sd * elapsed
-        return predicted, PosePrior(predicted, sd**-2)
-
-    def _follow(
-        self,
-        observation: Observation,
-        size: Float[Tensor, "#batch sizes"],
-        predicted: Float[Tensor, "1 parameters"],
-        prior: PosePrior,
-    ) -> Registration:
-        """Register from the prediction and from the last pose, and keep what fits better."""
-        assert self._pose is not None
-        starts = torch.cat([predicted, self._pose])
-        both = self.registrar(
-            observation, starts, size, PosePrior(prior.mean.repeat(2, 1), prior.precision.repeat(2, 1))
-        )
-        return both.take(both.score.nan_to_num(nan=torch.inf).argmin()[None])
 
     def _stray(self, found: Registration) -> float:
         """Share of the points that are believed to be of no part."""
@@ -214,3 +237,56 @@ class Tracker(nn.Module):
         if self._pose is not None and time_s > self._time:
             self._velocity = (found.pose - self._pose) / (time_s - self._time)
         self._pose, self._time = found.pose, time_s
+
+
+@dataclass(frozen=True)
+class Person:
+    """What a tracker is asked of one person in one frame; see `Tracker.forward`."""
+
+    tracker: Tracker
+    time_s: float
+    observation: Observation | None
+    faces: Faces | None
+    size: Float[Tensor, "#batch sizes"]
+    cut: bool = False
+    root: Gaussian | None = None
+
+
+def track_together(people: Sequence[Person]) -> list[TrackedFrame]:
+    """The answers for several people in one frame, who are registered as one batch.
+
+    They must share body and settings. Searches for limbs and cold starts, which some need, are each person's own.
+    """
+    begun = [person.tracker.begin_frame(person) for person in people]
+    going = [
+        (person, expected, person.observation)
+        for person, expected in zip(people, begun, strict=True)
+        if isinstance(expected, Expected) and person.observation is not None
+    ]
+    if not going:
+        return [answer for answer in begun if isinstance(answer, TrackedFrame)]
+    # From the prediction and from the last pose; what fits better is kept.
+    twice = torch.arange(len(going)).repeat_interleave(2)
+    observation = going[0][2]  # which serves any number of starts
+    if len(going) > 1:
+        observation = stack_observations([observation for _, _, observation in going]).take(twice)
+    prior = PosePrior(
+        torch.cat([expected.prior.mean for _, expected, _ in going])[twice],
+        torch.cat([expected.prior.precision for _, expected, _ in going])[twice],
+    )
+    both = going[0][0].tracker.registrar(
+        observation,
+        torch.cat([expected.starts for _, expected, _ in going]),
+        torch.cat([person.size for person, _, _ in going])[twice],
+        prior,
+    )
+    best = both.score.nan_to_num(nan=torch.inf).view(-1, 2).argmin(1)
+    found = both.take(2 * torch.arange(len(best), device=best.device) + best)
+    rows = iter(range(len(going)))
+    answers = []
+    for person, answer in zip(people, begun, strict=True):
+        if isinstance(answer, Expected):
+            one = found.take(torch.tensor([next(rows)], device=best.device))
+            answer = person.tracker.end_frame(person, one, answer.prior)
+        answers.append(answer)
+    return answers
