@@ -218,6 +218,11 @@ class StereoRenderer(nn.Module):
         self._constant("lamp", _looking_at(self.light, self.light.new_tensor([0, 0.1, 3.1])))
         self._see_room(Room(config.room, random_stream("room", config.room.seed), furniture))
 
+    @property
+    def people(self) -> list[Actor]:
+        """Who is drawn, in the order of the poses."""
+        return [actor for actor in self.actors if isinstance(actor, Actor)]
+
     def _constant(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
 
@@ -251,16 +256,16 @@ class StereoRenderer(nn.Module):
     def forward(self, posed: PosedBody | Sequence[PosedBody], first_frame: int = 0) -> StereoFrames:
         """Render the people posed, one for each; row i is frame `first_frame + i`, which decides its noise."""
         each = (posed,) if isinstance(posed, PosedBody) else tuple(posed)
-        if len(each) != len(self.actors):
+        if len(each) != len(self.people):
             raise ValueError(
-                f"there must be a pose for each of {len(self.actors)} people, got {len(each)}; pose all"
+                f"there must be a pose for each of {len(self.people)} people, got {len(each)}; pose all"
             )
-        parts = [actor.display(one) for actor, one in zip(self.actors, each, strict=True)]
+        parts = [actor.display(one) for actor, one in zip(self.people, each, strict=True)]
         frames = []
         for i in range(len(parts[0].origins)):
             scenes = [
                 PosedShapes(actor.display.shapes, part.rotations[i], part.origins[i])
-                for actor, part in zip(self.actors, parts, strict=True)
+                for actor, part in zip(self.people, parts, strict=True)
             ]
             shadows = [
                 _Shadow(scene.seen_from(self.light, self.lamp), self.config.shadow_map) for scene in scenes
@@ -307,15 +312,10 @@ class StereoRenderer(nn.Module):
             patch.copy_(seen.T.reshape(3, *size))
             found = part >= 0
             beyond.copy_(torch.where(found, hits.depth.reshape(size), beyond))
-            segments = self._actor(k).display.segments[part] + 1
+            segments = self.people[k].display.segments[part] + 1
             labels[rows, columns] = torch.where(found, segments, labels[rows, columns])
             people[rows, columns] = torch.where(found, k + 1, people[rows, columns])
         return image, depth, labels, people
-
-    def _actor(self, index: int) -> Actor:
-        actor = self.actors[index]
-        assert isinstance(actor, Actor)
-        return actor
 
     def _pixels(self, rows: slice, columns: slice) -> Float[Tensor, "num 2"]:
         """Centres (u, v) of the pixels of a window, row by row."""
@@ -352,7 +352,7 @@ class StereoRenderer(nn.Module):
         part: Int[Tensor, " num"],
     ) -> Float[Tensor, "num 3"]:
         """RGB of points (m, from the eye) on the parts of a person."""
-        actor = self._actor(index)
+        actor = self.people[index]
         local, normal = posed.on_parts(points, part)
         albedo = actor.paint(local, part, points[:, 2] / self.camera.focal_length)
         toward = self.light - (points + self.eyes[eye])
