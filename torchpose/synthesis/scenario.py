@@ -20,9 +20,9 @@ FRONT, BACK = 3.1, 4.2  # m, ways across the room
 def unlike(seed: int) -> tuple[Person, Person]:
     """Two people who differ in size and in the colour of their shirts."""
     draw = Draw("two people", seed)
-    first = draw_person(int(draw(0, 1e6)))
+    first = draw_person(int(draw(0.0, 1e6)))
     while True:
-        second = draw_person(int(draw(0, 1e6)))
+        second = draw_person(int(draw(0.0, 1e6)))
         if math.dist(first.colours[2], second.colours[2]) > 0.3 and abs(first.height - second.height) > 0.08:
             return first, second
 
@@ -38,8 +38,8 @@ def crossing(seed: int, kind: str | None = None) -> Company:
         raise ValueError(f"kind must be one of {', '.join(CROSSINGS)}, got {kind!r}")
     draw = Draw("crossing", kind, seed)
     people = unlike(seed)
-    side = 1.0 if draw(0, 1) < 0.5 else -1.0  # where the first one comes from: -1 is the image's left
-    near = int(draw(0, 2))  # which of them passes nearer to the camera
+    side = 1.0 if draw(0.0, 1.0) < 0.5 else -1.0  # where the first one comes from: -1 is the image's left
+    near = int(draw(0.0, 2.0))  # which of them passes nearer to the camera
     depth = [FRONT + draw(-0.1, 0.1) if k == near else BACK + draw(-0.35, 0.2) for k in (0, 1)]
     pace = [draw(0.8, 1.25), draw(0.8, 1.25)]
 
@@ -104,7 +104,7 @@ def counter(x: float, width: float, z: float = 2.95, height: float = 1.0, floor:
 def behind_counter(seed: int) -> Company:
     """Somebody comes in, stands in full view, and then for 2.4 s behind a counter, moving the arms, and leaves."""
     draw = Draw("counter", seed)
-    side = 1.0 if draw(0, 1) < 0.5 else -1.0
+    side = 1.0 if draw(0.0, 1.0) < 0.5 else -1.0
     depth = 3.7 + draw(-0.05, 0.05)
     pace = draw(0.85, 1.1)
     way, open_spot, hidden_spot = 0.5334 * depth + 0.55, 1.05, 0.35 + draw(-0.1, 0.1)
@@ -117,7 +117,7 @@ def behind_counter(seed: int) -> Company:
         tuple((side * x, depth) for x in (way, open_spot, open_spot, -hidden_spot, -hidden_spot, -way)),
         gestures=((shown, leaves + 0.4), (hidden - 0.3, out + 0.3)),
     )
-    guest = Guest(draw_person(int(draw(0, 1e6))), path, seed)
+    guest = Guest(draw_person(int(draw(0.0, 1e6))), path, seed)
     furniture = (counter(-side * 0.35, 1.25),)
     return Company(f"counter {seed}", (guest,), round(path.times[-1] + 0.6, 1), furniture, seed)
 
@@ -125,7 +125,7 @@ def behind_counter(seed: int) -> Company:
 def visit(seed: int) -> Company:
     """Somebody comes in, goes to the middle, sits down for a while, gets up, and leaves on the other side."""
     draw = Draw("visit", seed)
-    side = 1.0 if draw(0, 1) < 0.5 else -1.0
+    side = 1.0 if draw(0.0, 1.0) < 0.5 else -1.0
     pace, way = draw(0.9, 1.2), 0.5334 * 3.9 + 0.55
     there = EMPTY + math.dist((way, 3.9), (0.0, 3.5)) / pace
     leaves = there + 4.0
@@ -134,5 +134,5 @@ def visit(seed: int) -> Company:
         ((side * way, 3.9), (0.0, 3.5), (0.0, 3.5), (-side * way, 3.9)),
         seated=((there + 0.4, leaves - 0.3),),
     )
-    guest = Guest(draw_person(int(draw(0, 1e6))), path, seed)
+    guest = Guest(draw_person(int(draw(0.0, 1e6))), path, seed)
     return Company(f"visit {seed}", (guest,), round(path.times[-1] + 0.6, 1), room=seed)
