@@ -1,4 +1,4 @@
-"""Companies by seed: two people who cross, somebody behind a counter, somebody who comes, sits down and goes.
+"""Companies by seed: people who cross or stand side by side, somebody behind a counter, somebody who comes and sits.
 
 Left-camera frame, metres, seconds; they are made for a camera like `synthetic_camera()`, whose view is 1.07 times as
 wide as it is deep.
@@ -136,3 +136,22 @@ def visit(seed: int) -> Company:
     )
     guest = Guest(draw_person(int(draw(0.0, 1e6))), path, seed)
     return Company(f"visit {seed}", (guest,), round(path.times[-1] + 0.6, 1), room=seed)
+
+
+def side_by_side(seed: int) -> Company:
+    """Two people come in from both sides, stand next to each other for 4 s, moving their arms, and leave again."""
+    draw = Draw("side by side", seed)
+    depth = [3.6 + draw(-0.2, 0.2) for _ in (0, 1)]
+    guests, end = [], 0.0
+    for k, (person, side) in enumerate(zip(unlike(seed), (-1.0, 1.0), strict=True)):
+        way, spot = 0.5334 * depth[k] + 0.55, 0.85
+        there = EMPTY + (way - spot) / draw(0.9, 1.2)
+        leaves = there + 4.0
+        path = Path(
+            (EMPTY, there, leaves, leaves + (way - spot)),
+            tuple((side * x, depth[k]) for x in (way, spot, spot, way)),
+            gestures=((there, leaves),),
+        )
+        guests.append(Guest(person, path, 2 * seed + k))
+        end = max(end, path.times[-1])
+    return Company(f"side by side {seed}", tuple(guests), round(end + 0.6, 1), room=seed)
