@@ -5,7 +5,7 @@ python -m benchmarks.following ../shared/data/realsense_rehab [--people ../share
 
 rehab     the real depth recording, by its README: frames 0 to 75 are empty, from 80 on somebody is there (76 to 79 do
           not count). `status` is the share of frames declared absent or present rightly: `absent` and `left` mean
-          absent, `entering`, `tracked`, `partial` and `recovered` present, and `lost` is neither. `answered` is over the
+          absent, `entering`, `tracked`, `partial` and `recovered` present, `lost` neither. `answered` is over the
           frames from 80 on; `median_px` between our joints, projected, and OpenPose's of confidence above 0.5: legs,
           arms and neck.
 leaving   people/walking_m2 turned to begin and end with an empty room (benchmarks.leaving). `status`: absent where
