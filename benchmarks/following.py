@@ -293,7 +293,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("rehab", type=Path, help="folder of realsense_rehab")
     parser.add_argument("settings", nargs="*", help="settings of infer.py, key=value")
     parser.add_argument("--people", type=Path, help="folder of people; beside the other one if not given")
-    parser.add_argument("--only", help="only measures whose name contains this")
+    parser.add_argument("--only", help="only the measure of this name, or those whose names contain it")
     parser.add_argument("--seeds", type=int, default=20, help="crossings; a quarter as many are hidden")
     parser.add_argument(
         "--json", type=Path, help="also write the figures, recording by recording, to this file"
@@ -314,6 +314,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         "hidden_stereo": [partial(hide, 0, config, stereo=True)],
     }
     chosen = [name for name in measures if not arguments.only or arguments.only in name]
+    if arguments.only in measures:  # the others' names may contain it
+        chosen = [arguments.only]
     if not chosen:
         parser.error(f"--only must be part of one of {', '.join(measures)}, got {arguments.only!r}")
     table: dict[str, list[dict[str, float]]] = {}

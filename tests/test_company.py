@@ -44,7 +44,7 @@ def company(*guests: int, furniture: tuple[Box, ...] = ()) -> CompanyRecording:
 
 @functools.cache
 def rendered(*guests: int, table: bool = False):
-    return company(*guests, furniture=(TABLE,) if table else ()).frames(18, 23)
+    return company(*guests, furniture=(TABLE,) if table else ()).frames(19, 22)
 
 
 def test_where_people_cross_the_nearer_one_is_seen_as_a_test_of_depths_of_single_pictures_says():
@@ -82,7 +82,7 @@ def test_the_truth_of_each_is_that_of_a_recording_alone():
 
 def test_masks_are_disjoint_and_are_the_renderer_s():
     recording, frames = company(0, 1), rendered(0, 1)
-    for row, index in enumerate(range(18, 23)):
+    for row, index in enumerate(range(19, 22)):
         one, other = recording.presence(index)
         assert not (one.mask & other.mask).any()
         for k, found in enumerate((one, other)):
@@ -130,7 +130,7 @@ def test_furniture_hides_what_lies_behind_it_and_stands_in_the_empty_room():
         darker == 0
     ).float().mean() > 0.8  # people before it would cast shadows on it, but they are behind
     read = recording.depth_frame(20)
-    assert torch.equal(read.people, behind.people[2])
+    assert torch.equal(read.people, behind.people[1])
 
 
 def test_casts_of_several_people_are_the_renderer_s():
@@ -148,18 +148,18 @@ def test_casts_of_several_people_are_the_renderer_s():
 
 
 def test_seeds_repeat_and_frames_do_not_depend_on_what_was_asked_before():
-    one, other = CompanyRecording(crossing(4), SMALL), CompanyRecording(crossing(4), SMALL)
+    one, other = CompanyRecording(crossing(4), TINY), CompanyRecording(crossing(4), TINY)
     one.depth_frame(3)
-    first, again = one.depth_frame(30), other.depth_frame(30)
+    first, again = one.depth_frame(20), other.depth_frame(20)
     assert torch.equal(first.colour, again.colour)
     assert torch.equal(first.depth.nan_to_num(), again.depth.nan_to_num())
-    assert torch.equal(one.frames(30, 31).right, other.frames(29, 31).right[1:])
-    elsewhere = CompanyRecording(crossing(5), SMALL)
+    assert torch.equal(one.frames(20, 21).right, other.frames(19, 21).right[1:])
+    elsewhere = CompanyRecording(crossing(5), TINY)
     assert not torch.equal(one.joints[0][:20], elsewhere.joints[0][:20])
     assert not torch.equal(one.empty_depth(0).nan_to_num(), one.empty_depth(1).nan_to_num())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_who_crosses_is_away_first_hides_the_other_and_is_unlike_it(seed: int):
     recording = CompanyRecording(crossing(seed), TINY)
     presence = [recording.presence(i) for i in range(len(recording))]  # every 0.2 s
@@ -182,7 +182,7 @@ def test_crossings_are_of_the_kind_asked_for():
         crossing(0, "dancing")
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_counter_hides_the_legs_alone_for_two_seconds(seed: int):
     recording = CompanyRecording(behind_counter(seed), TINY)
     seen = torch.stack([recording.presence(i)[0].joints for i in range(len(recording))])
