@@ -133,6 +133,21 @@ def test_furniture_hides_what_lies_behind_it_and_stands_in_the_empty_room():
     assert torch.equal(read.people, behind.people[1])
 
 
+def test_nobody_casts_a_shadow_on_what_stands_between_them_and_the_lamp():
+    recording = company(0, furniture=(TABLE,))
+    frames, (left, _) = recording.frames(25, 29), recording.background(1)
+    free = company(0).background(1)[0][0]
+    table = (free - left[0]).abs().amax(0) > 0.02  # and its own shadow, behind it
+    v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    points = SMALL.back_project(torch.stack((u, v), -1).expand(4, -1, -1, -1), frames.depth)
+    near = table & (points[..., 2] < 2.7) & (points[..., 1] < 1.0)
+    near &= ~(torch.nn.functional.max_pool2d(frames.mask.float(), 3, 1, 1) > 0)
+    darker = (left - frames.left).amax(1)
+    assert near.flatten(1).sum(1).min() > 800
+    assert darker[near].max() < 1e-6
+    assert (darker > 0.05).flatten(1).sum(1).min() > 100  # on the floor there is one
+
+
 def test_casts_of_several_people_are_the_renderer_s():
     recording = company(0, 1)
     displays = [DisplayModel(BODY, person) for person in PEOPLE]
