@@ -59,7 +59,10 @@ ROOMS: dict[str, tuple[str, ...]] = {
         *("dataset", "skeleton", "subspace", "features"),
         *("inference", "hmm", "codebook", "recognizer", "diary"),
     ),
-    "synthesis": ("motion", "room", "render", "depth", "database"),
+    "synthesis": (
+        *("motion", "path", "box", "room", "actor", "render", "depth"),
+        *("database", "company", "scenario"),
+    ),
     "learning": ("part_network", "training"),
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),

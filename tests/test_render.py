@@ -121,14 +121,15 @@ def test_furniture_is_met_where_marching_along_the_ray_enters_it():
     )
     origins = torch.zeros(250, 3)
     hits = room.cast(origins, directions)
-    angle = torch.atan2(room.sines, room.cosines)
+    boxes = room.furniture
+    angle = torch.atan2(boxes.sines, boxes.cosines)
     zero, one = torch.zeros_like(angle), torch.ones_like(angle)
     rows = (angle.cos(), zero, angle.sin(), zero, one, zero, -angle.sin(), zero, angle.cos())
     turn = torch.stack(rows, -1).unflatten(-1, (3, 3))  # R_world_box
 
     def inside(points: Tensor, slack: float) -> Tensor:
-        local = (turn.mT @ (points[..., None, :] - room.centers)[..., None])[..., 0]
-        return ((local.abs() - room.halves).amax(-1) < slack).any(-1)
+        local = (turn.mT @ (points[..., None, :] - boxes.centers)[..., None])[..., 0]
+        return ((local.abs() - boxes.halves).amax(-1) < slack).any(-1)
 
     share = torch.linspace(0, 0.9995, 800)[:, None, None]
     assert not inside(share * hits.distance[:, None] * directions, -2e-3).any()

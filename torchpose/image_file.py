@@ -97,6 +97,8 @@ def write_image(path: Path, image: Tensor | None, suffix: str) -> None:
 
 def encode(path: Path, pixels: np.ndarray) -> None:
     """Write pixels, as OpenCV orders them, as the kind of image that the path's suffix says; the file appears whole."""
-    _, data = cv2.imencode(path.suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    # OpenCV complains on stderr of a setting that the other format does not know.
+    settings = [] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    _, data = cv2.imencode(path.suffix, pixels, settings)
     with replacing(path) as partial:
         partial.write_bytes(data.tobytes())

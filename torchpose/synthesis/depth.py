@@ -1,10 +1,11 @@
-"""The depth of a drawn person without any images, and what a stereo matcher would make of it.
+"""The depth of drawn people without any images, and what a stereo matcher would make of it.
 
-Left-camera frame (x right, y down, z forward), metres; pixels (u, v); disparities in px. Only the window about the
-person is cast and spoiled, so a frame costs some 50 ms of one core.
+Left-camera frame (x right, y down, z forward), metres; pixels (u, v); disparities in px. Only the window about each
+person is cast, and what is within the mask spoiled, so a frame costs some 50 ms of one core.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,55 +16,108 @@ from torch import Tensor
 
 from torchpose.body.model import PosedBody
 from torchpose.body.superquadric import DisplayModel
+from torchpose.synthesis.box import Box, Boxes
 from torchpose.synthesis.render import PosedShapes, cast
 from torchpose.vision.camera import StereoCamera
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands about the person: a floor and a wall."""
+    """What stands about people: a floor, a wall and furniture."""
 
     floor: float = 1.0  # m below the camera
     wall: float = 5.5  # m before it
+    furniture: tuple[Box, ...] = ()
+
+    def depth(self, camera: StereoCamera, like: Tensor) -> Float[Tensor, "height width"]:
+        """Exact depth of the empty scene, m."""
+        v, u = (torch.arange(n, device=like.device, dtype=like.dtype) for n in (camera.height, camera.width))
+        # Rays meet the floor below the horizon alone.
+        below = ((v - camera.cy) / camera.focal_length).clamp_min(self.floor / self.wall / 2)
+        empty = (self.floor / below).clamp_max(self.wall)[:, None].expand(-1, camera.width)
+        if not self.furniture:
+            return empty
+        rays = camera.back_project(torch.cartesian_prod(v, u).flip(-1), like.new_ones(len(v) * len(u)))
+        near = Boxes(self.furniture).to(like)(torch.zeros_like(rays), rays).distance
+        return torch.minimum(empty, near.view_as(empty))
+
+
+@dataclass(frozen=True)
+class CastPeople:
+    """What one frame's rays through the pixels' centres meet."""
+
+    depth: Float[Tensor, "height width"]  # m, of people and of what is beyond
+    people: Int[Tensor, "height width"]  # 0 the scene, k + 1 the k-th of the people
+    parts: Int[Tensor, "height width"]  # of that one's shapes; -1 in the scene
+
+
+def cast_people(
+    people: Sequence[PosedShapes], camera: StereoCamera, beyond: Float[Tensor, "height width"]
+) -> CastPeople:
+    """Cast one ray a pixel at each of the people before a scene with the depth `beyond`; the nearest is seen."""
+    v, u = (torch.arange(n).to(beyond) for n in (camera.height, camera.width))
+    depth = beyond.clone()
+    whose = torch.zeros_like(depth, dtype=torch.long)
+    parts = torch.full_like(whose, -1)
+    for k, shapes in enumerate(people):
+        rows, columns = shapes.window(camera)
+        pixels = torch.cartesian_prod(v[rows], u[columns]).flip(-1)
+        hits = cast(shapes, camera.back_project(pixels, torch.ones_like(pixels[:, 0])))
+        here = depth[rows, columns]
+        part, reach = hits.part.view_as(here), hits.depth.view_as(here)
+        seen = (part >= 0) & (reach < here)
+        whose[rows, columns] = torch.where(seen, k + 1, whose[rows, columns])
+        parts[rows, columns] = torch.where(seen, part, parts[rows, columns])
+        here.copy_(torch.where(seen, reach, here))
+    return CastPeople(depth, whose, parts)
 
 
 @dataclass(frozen=True)
 class DepthFrames:
     """Exact depth at the pixels' centres."""
 
-    depth: Float[Tensor, "batch height width"]  # m, of person, floor and wall
+    depth: Float[Tensor, "batch height width"]  # m, of people and scene
     labels: Int[Tensor, "batch height width"]  # 0 the scene, k + 1 segment k
+    people: Int[Tensor, "batch height width"]  # 0 the scene, k + 1 the k-th of the people
 
     @property
     def mask(self) -> Bool[Tensor, "batch height width"]:
-        """Where the person is."""
+        """Where anybody is."""
         return self.labels > 0
 
 
 @torch.no_grad()
 def cast_depth(
-    display: DisplayModel, posed: PosedBody, camera: StereoCamera, scene: Scene = Scene()
+    display: DisplayModel | Sequence[DisplayModel],
+    posed: PosedBody | Sequence[PosedBody],
+    camera: StereoCamera,
+    scene: Scene = Scene(),
 ) -> DepthFrames:
-    """Cast one ray a pixel at the person in each of the poses."""
-    device, dtype = posed.origins.device, posed.origins.dtype
-    v, u = (torch.arange(n, device=device, dtype=dtype) for n in (camera.height, camera.width))
-    # Rays meet the floor below the horizon alone.
-    below = ((v - camera.cy) / camera.focal_length).clamp_min(scene.floor / scene.wall / 2)
-    empty = (scene.floor / below).clamp_max(scene.wall)[:, None].expand(-1, camera.width)
-    parts = display(posed)
-    depth = empty.repeat(len(parts.origins), 1, 1)
-    labels = torch.zeros_like(depth, dtype=torch.long)
-    for i, (rotations, origins) in enumerate(zip(parts.rotations, parts.origins, strict=True)):
-        shapes = PosedShapes(display.shapes, rotations, origins)
-        rows, columns = shapes.window(camera)
-        pixels = torch.cartesian_prod(v[rows], u[columns]).flip(-1)
-        hits = cast(shapes, camera.back_project(pixels, torch.ones_like(pixels[:, 0])))
-        here = depth[i, rows, columns]
-        part, reach = hits.part.view_as(here), hits.depth.view_as(here)
-        seen = (part >= 0) & (reach < here)
-        labels[i, rows, columns] = torch.where(seen, display.segments[part] + 1, 0)
-        here.copy_(torch.where(seen, reach, here))
-    return DepthFrames(depth, labels)
+    """Cast one ray a pixel at the person in each of the poses, or at several people, each in poses of their own.
+
+    Raises ValueError unless there are as many displays as poses.
+    """
+    displays = (display,) if isinstance(display, DisplayModel) else tuple(display)
+    bodies = (posed,) if isinstance(posed, PosedBody) else tuple(posed)
+    if not displays or len(displays) != len(bodies):
+        raise ValueError(
+            f"there must be a pose for each of the people, got {len(displays)} people and {len(bodies)} "
+            "poses; give as many"
+        )
+    empty = scene.depth(camera, bodies[0].origins)
+    moved = [one(body) for one, body in zip(displays, bodies, strict=True)]
+    frames = []
+    for i in range(len(bodies[0].origins)):
+        shapes = [
+            PosedShapes(one.shapes, parts.rotations[i], parts.origins[i])
+            for one, parts in zip(displays, moved, strict=True)
+        ]
+        found = cast_people(shapes, camera, empty)
+        labels = torch.zeros_like(found.parts)
+        for k, one in enumerate(displays):
+            labels = torch.where(found.people == k + 1, one.segments[found.parts] + 1, labels)
+        frames.append((found.depth, labels, found.people))
+    return DepthFrames(*(torch.stack(column) for column in zip(*frames, strict=True)))
 
 
 @dataclass(frozen=True)

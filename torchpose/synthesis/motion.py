@@ -58,7 +58,7 @@ class MotionConfig:
                 raise ValueError(f"{name} must be a positive range, low to high, got {low} to {high}")
 
 
-class _Draw:
+class Draw:
     """Numbers about a person or a take, one after the other from a stream."""
 
     def __init__(self, *names: int | str):
@@ -74,7 +74,7 @@ class _Draw:
 
 
 @dataclass(frozen=True)
-class _Figure:
+class Figure:
     """How the limbs are held, without the place. A limb is raised by an angle from hanging, towards an
     azimuth.
 
@@ -92,7 +92,7 @@ class _Figure:
     leader: float = 0.0  # m by which the left foot may count as lower than it is (negative: the right one)
 
 
-_Act = Callable[[_Draw, _Draw, Tensor, float], _Figure]
+_Act = Callable[[Draw, Draw, Tensor, float], Figure]
 
 
 def _directions(angles: Float[Tensor, "2 4 time"]) -> Float[Tensor, "2 2 time 3"]:
@@ -102,7 +102,7 @@ def _directions(angles: Float[Tensor, "2 4 time"]) -> Float[Tensor, "2 2 time 3"
     return torch.stack((out * rise.sin() * azimuth.cos(), rise.cos(), -rise.sin() * azimuth.sin()), -1)
 
 
-def _standing(draw: _Draw, times: Tensor) -> _Figure:
+def stand_at_ease(draw: Draw, times: Tensor) -> Figure:
     """A person who stands at ease, never quite still."""
 
     def held(rows: list[float], amplitude: float) -> Tensor:
@@ -110,7 +110,7 @@ def _standing(draw: _Draw, times: Tensor) -> _Figure:
 
     arm = [draw(0.08, 0.18), draw(0.3, 0.8), draw(0.15, 0.35), draw(0.9, 1.4)]
     leg = [draw(0.03, 0.09), draw(0.1, 0.6), draw(0.0, 0.05), draw(0.1, 0.6)]
-    return _Figure(
+    return Figure(
         arms=torch.stack([held(arm, 0.05), held(arm, 0.05)]),
         legs=torch.stack([held(leg, 0.01), held(leg, 0.01)]),
         trunk=held([0.0, draw(-0.03, 0.06), 0.0], 0.03),
@@ -118,7 +118,7 @@ def _standing(draw: _Draw, times: Tensor) -> _Figure:
     )
 
 
-def _repetition(draw: _Draw, times: Tensor, period: float) -> Float[Tensor, " time"]:
+def _repetition(draw: Draw, times: Tensor, period: float) -> Float[Tensor, " time"]:
     """Phase (rad) of a repeated movement: a person's tempo wanders a little."""
     return math.tau * (times / (period * draw(0.92, 1.08)) + draw(0.0, 1.0)) + draw.drift(times, 0.35)
 
@@ -130,8 +130,8 @@ def _up_and_down(phase: Float[Tensor, " time"]) -> Float[Tensor, " time"]:
 
 
 def _raise_hands(sides: tuple[int, ...]) -> _Act:
-    def act(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-        figure = _standing(take, times)
+    def act(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
+        figure = stand_at_ease(take, times)
         top, azimuth, bend = style(2.25, 2.75), style(0.35, 1.35), style(0.1, 0.9)
         phase = _repetition(take, times, period)
         for side in sides:
@@ -147,8 +147,8 @@ def _raise_hands(sides: tuple[int, ...]) -> _Act:
     return act
 
 
-def _box(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-    figure = _standing(take, times)
+def _box(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
+    figure = stand_at_ease(take, times)
     guard = times.new_tensor([style(0.15, 0.45), style(0.7, 1.1), style(2.4, 2.7), style(1.6, 1.9)])
     punch = times.new_tensor([style(1.3, 1.5), style(1.35, 1.5), style(1.4, 1.6), style(1.5, 1.7)])
     phase = _repetition(take, times, period / 1.3)
@@ -164,12 +164,12 @@ def _box(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
 
 
 def _raise_leg(side: int) -> _Act:
-    def act(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-        figure = _standing(take, times)
+    def act(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
+        figure = stand_at_ease(take, times)
         lift = _up_and_down(_repetition(take, times, period)) * (1 + take.drift(times, 0.05))
         top, knee, azimuth = style(0.85, 1.35), style(0.65, 1.1), style(1.3, 1.5)
         figure.legs[side, 0] += top * take(0.92, 1.0) * lift
-        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * _soon(lift)
+        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * soon(lift)
         figure.legs[side, 2] += top * (1 - knee) * lift
         figure.legs[side, 3] = azimuth
         figure.arms[:, 0] += style(0.0, 0.2) * lift  # for balance
@@ -179,8 +179,8 @@ def _raise_leg(side: int) -> _Act:
     return act
 
 
-def _walk(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-    figure = _standing(take, times)
+def _walk(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
+    figure = stand_at_ease(take, times)
     phase = _repetition(take, times, period / 1.6)
     stride, swing, knee, bend = style(0.28, 0.42), style(0.25, 0.5), style(0.75, 1.1), style(0.2, 0.6)
     for side in (LEFT, RIGHT):
@@ -199,37 +199,41 @@ def _walk(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
     return replace(figure, planted=False)
 
 
-def _sit(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-    figure = _standing(take, times)
-    down = _up_and_down(_repetition(take, times, 1.3 * period))
+def _sit(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
+    figure = stand_at_ease(take, times)
+    sit_down(figure, style, take, _up_and_down(_repetition(take, times, 1.3 * period)))
+    return figure
+
+
+def sit_down(figure: Figure, style: Draw, take: Draw, down: Float[Tensor, " time"]) -> None:
+    """Bring a figure from standing (0) to sitting (1)."""
     thigh, shank, spread = style(1.25, 1.5), style(0.1, 0.25), style(1.3, 1.5)
     hands, reach = style(0.3, 0.8), style(0.4, 0.9)
     for side in (LEFT, RIGHT):
         figure.legs[side, 0] += (thigh - figure.legs[side, 0]) * down
-        figure.legs[side, 1] += (spread - figure.legs[side, 1]) * _soon(down)
+        figure.legs[side, 1] += (spread - figure.legs[side, 1]) * soon(down)
         figure.legs[side, 2] -= shank * down
         figure.legs[side, 3] = AHEAD
         figure.arms[side, 0] += (hands * take(0.9, 1.1) - figure.arms[side, 0]) * down
         figure.arms[side, 1] += (AHEAD - 0.2 - figure.arms[side, 1]) * down
         figure.arms[side, 2] += reach * down
     figure.trunk[1] += 4 * style(0.08, 0.14) * down * (1 - down) + style(0.0, 0.15) * down
-    return figure
 
 
-def _exercise_arms(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+def _exercise_arms(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
     """Elbows and shoulders move and nothing else does (T. 5.1)."""
-    still, T = _standing(take, times[:1]), len(times)
-    figure = _Figure(
+    still, T = stand_at_ease(take, times[:1]), len(times)
+    figure = Figure(
         arms=still.arms.repeat(1, 1, T),
         legs=still.legs.repeat(1, 1, T),
         trunk=still.trunk.repeat(1, T),
         head=still.head.repeat(1, T),
     )
-    _wander_arms(figure, take, times, 1.8 / period)
+    wander_arms(figure, take, times, 1.8 / period)
     return figure
 
 
-def _wander_arms(figure: _Figure, take: _Draw, times: Tensor, pace: float) -> None:
+def wander_arms(figure: Figure, take: Draw, times: Tensor, pace: float) -> None:
     """Shoulders and elbows wander through their range, up to `pace` Hz."""
     for side in (LEFT, RIGHT):
         rise = 1.0 + take.drift(times, 0.95, pace)
@@ -242,8 +246,8 @@ def _wander_arms(figure: _Figure, take: _Draw, times: Tensor, pace: float) -> No
 def _bend_elbows(up: bool) -> _Act:
     """The upper arms are held out; the forearms go from straight to a right angle, forward or up."""
 
-    def act(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-        figure = _standing(take, times)
+    def act(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
+        figure = stand_at_ease(take, times)
         rise, azimuth, bend = style(1.4, 1.6), style(0.05, 0.3), style(1.35, 1.65)
         phase = _repetition(take, times, period)
         for side in (LEFT, RIGHT):
@@ -257,30 +261,30 @@ def _bend_elbows(up: bool) -> _Act:
     return act
 
 
-def _bend_knees(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+def _bend_knees(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
     """A knee is lifted until thigh and shank make a right angle, the right one and the left in turn."""
-    figure = _standing(take, times)
+    figure = stand_at_ease(take, times)
     phase = _repetition(take, times, period)
     top, azimuth = style(1.2, 1.5), style(1.3, 1.5)
     for side in (LEFT, RIGHT):
         own = (phase / math.tau).floor().remainder(2) != side
         lift = own * _up_and_down(phase) * take(0.92, 1.0)
         figure.legs[side, 0] += top * lift
-        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * _soon(lift)
+        figure.legs[side, 1] += (azimuth - figure.legs[side, 1]) * soon(lift)
         figure.legs[side, 2] -= (math.pi / 2 - top) * lift
         figure.legs[side, 3] = azimuth
     figure.arms[:, 0] += style(0.0, 0.2)
     return figure
 
 
-def _circle_arms(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+def _circle_arms(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
     """Straight arms go up at the sides, down to the front, out to the sides and down again (T. Fig. 5.6)."""
-    figure = _standing(take, times)
+    figure = stand_at_ease(take, times)
     phase = _repetition(take, times, 2.4 * period)
     top, level, front = style(2.5, 2.75), style(1.45, 1.6), style(1.3, 1.45)
     for side in (LEFT, RIGHT):
         own = (phase + take(-0.1, 0.1)).remainder(math.tau) * (4 / math.tau)  # quarters of the round
-        up, over, out, down = (_smooth(own - quarter) for quarter in range(4))
+        up, over, out, down = (smooth_step(own - quarter) for quarter in range(4))
         hanging = figure.arms[side, 0].clone()
         figure.arms[side, 0] += (top - hanging) * up + (level - top) * over - (level - hanging) * down
         figure.arms[side, 1] = take(0.1, 0.3) + (front - 0.2) * (over - out)
@@ -289,9 +293,9 @@ def _circle_arms(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Fi
     return figure
 
 
-def _turn(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+def _turn(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
     """The trunk turns to the right and to the left, 40 degrees each."""
-    figure = _standing(take, times)
+    figure = stand_at_ease(take, times)
     phase = _repetition(take, times, 1.5 * period)
     figure.trunk[0] += 0.7 * phase.sin() * take(0.95, 1.0)
     swing, bend = style(0.1, 0.3), style(0.1, 0.9)
@@ -301,16 +305,16 @@ def _turn(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
     return figure
 
 
-def _move_freely(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
-    figure = _standing(take, times)
+def _move_freely(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
+    figure = stand_at_ease(take, times)
     pace = 1 / period
-    _wander_arms(figure, take, times, pace)
+    wander_arms(figure, take, times, pace)
     # One foot stands while the other is lifted a little.
     balance = take.drift(times, 1.0, pace)
     for side in (LEFT, RIGHT):
-        lift = _smooth(balance if side == LEFT else -balance) * take(0.5, 0.9)
+        lift = smooth_step(balance if side == LEFT else -balance) * take(0.5, 0.9)
         figure.legs[side, 0] += lift
-        figure.legs[side, 1] += (AHEAD - take(0.0, 0.5) - figure.legs[side, 1]) * _soon(lift)
+        figure.legs[side, 1] += (AHEAD - take(0.0, 0.5) - figure.legs[side, 1]) * soon(lift)
         figure.legs[side, 2] -= 0.3 * lift
         figure.legs[side, 3] = AHEAD
     figure.trunk[:] += torch.stack([take.drift(times, amplitude, pace) for amplitude in (0.35, 0.15, 0.1)])
@@ -318,16 +322,16 @@ def _move_freely(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Fi
     return figure
 
 
-def _demonstrate(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Figure:
+def _demonstrate(style: Draw, take: Draw, times: Tensor, period: float) -> Figure:
     """Both hands go up, and down again to the sides; then a step forward with the left leg. 2.5 seconds."""
-    figure = _standing(take, times)
-    up = _smooth(times / 0.9) * (1 - _smooth((times - 1.0) / 0.8))
+    figure = stand_at_ease(take, times)
+    up = smooth_step(times / 0.9) * (1 - smooth_step((times - 1.0) / 0.8))
     for side in (LEFT, RIGHT):
         figure.arms[side, 0] += 2.35 * up
         figure.arms[side, 1] = 0.45 + 0.15 * side
         figure.arms[side, 2] += 2.5 * up
         figure.arms[side, 3] += (0.6 - figure.arms[side, 3]) * up
-    lift, step = _bump((times - 1.5) / 0.8), _smooth((times - 1.6) / 0.8)
+    lift, step = _bump((times - 1.5) / 0.8), smooth_step((times - 1.6) / 0.8)
     figure.legs[LEFT, 0] += 0.75 * lift + 0.26 * step
     figure.legs[LEFT, 2] += 0.22 * step - 0.15 * lift
     figure.legs[RIGHT, 0] -= 0.22 * step
@@ -338,14 +342,14 @@ def _demonstrate(style: _Draw, take: _Draw, times: Tensor, period: float) -> _Fi
     return replace(figure, leader=-1.0)
 
 
-def _soon(lift: Tensor) -> Tensor:
+def soon(lift: Tensor) -> Tensor:
     """How far a limb has found its plane, 0 to 1: long before it is up, so that it does not swing out
     sideways.
     """
     return lift / (lift + 0.05)
 
 
-def _smooth(x: Tensor) -> Tensor:
+def smooth_step(x: Tensor) -> Tensor:
     """From 0 to 1 as x does, without corners; 0 before, 1 after."""
     x = x.clamp(0, 1)
     return x * x * x * (10 - 15 * x + 6 * x * x)
@@ -395,11 +399,21 @@ def perform(
     if motion not in _ACTS:
         raise ValueError(f"the motion must be one of {', '.join(MOTIONS)}, got {motion!r}")
     times = times.to(size)
-    style, draw = _Draw("style", motion, person), _Draw("take", motion, person, take)
-    place = _Draw("place", person, take, motion)
+    style, draw = Draw("style", motion, person), Draw("take", motion, person, take)
+    place = Draw("place", person, take, motion)
     figure = _ACTS[motion](style, draw, times, place(*config.period))
     facing = 0.25 if motion in ("demo", "turning") else config.heading
     heading = facing * place(-1.0, 1.0)
+    pose = pose_figure(body, figure, times.new_tensor(heading).expand_as(times))
+    near, far = _distances(body, size, camera, config)
+    spot = torch.tensor([config.aside * place(-1.0, 1.0), place(near, far)]).to(size)
+    return torch.cat((_stand(body, size, pose, figure, heading, spot, config.floor), pose[:, 3:]), -1)
+
+
+def pose_figure(
+    body: BodyModel, figure: Figure, heading: Float[Tensor, " time"]
+) -> Float[Tensor, "time parameters"]:
+    """A figure's poses within the body's limits, the root at the camera. `heading` is the yaw, rad: 0 faces it."""
     turn, lean, tilt = figure.trunk
     nod, aslant = figure.head
     leaning = exp_rotation(_along(1, turn)) @ exp_rotation(_along(0, lean)) @ exp_rotation(_along(2, tilt))
@@ -411,10 +425,7 @@ def perform(
     directions = torch.cat((head[:, None], arms, legs), 1)
     angles = torch.stack((heading + turn, lean, tilt), -1)
     pose = body.pose_from_directions(torch.zeros_like(angles), angles, directions)
-    pose = torch.maximum(torch.minimum(pose, body.high), body.low)
-    near, far = _distances(body, size, camera, config)
-    spot = torch.tensor([config.aside * place(-1.0, 1.0), place(near, far)]).to(size)
-    return torch.cat((_stand(body, size, pose, figure, heading, spot, config.floor), pose[:, 3:]), -1)
+    return torch.maximum(torch.minimum(pose, body.high), body.low)
 
 
 def _along(axis: int, angle: Float[Tensor, " time"]) -> Float[Tensor, "time 3"]:
@@ -425,7 +436,7 @@ def _stand(
     body: BodyModel,
     size: Float[Tensor, "1 sizes"],
     pose: Float[Tensor, "time parameters"],
-    figure: _Figure,
+    figure: Figure,
     heading: float,
     spot: Float[Tensor, "2"],
     floor: float,
@@ -435,7 +446,7 @@ def _stand(
     """
     posed = body(pose, size)
     soles = lowest(body, posed)  # (T, 2)
-    height = floor - 0.004 * torch.logsumexp(soles / 0.004, -1)  # a maximum without a corner
+    height = root_height(soles, floor)
     if not figure.planted:
         return torch.stack((spot[0].expand_as(height), height, spot[1].expand_as(height)), -1)
     bears = torch.softmax((soles + soles.new_tensor([figure.leader, -figure.leader]) / 2) / 0.03, -1)
@@ -446,6 +457,11 @@ def _stand(
     feet = _joints(body, posed, "ankle")[..., 0::2]
     across = spot + (bears[..., None] * (hips - feet)).sum(1)
     return torch.stack((across[:, 0], height, across[:, 1]), -1)
+
+
+def root_height(soles: Float[Tensor, "time 2"], floor: float) -> Float[Tensor, " time"]:
+    """The root's y (m) that puts the lower of two soles on the floor; they were found with the root at 0."""
+    return floor - 0.004 * torch.logsumexp(soles / 0.004, -1)  # a maximum without a corner
 
 
 def lowest(body: BodyModel, posed: PosedBody) -> Float[Tensor, "batch 2"]:

@@ -1,11 +1,11 @@
-"""Stereo pairs of a drawn person in a room, ray-cast in torch, with true depth and part labels.
+"""Stereo pairs of drawn people in a room, ray-cast in torch, with true depth and part labels.
 
-The world is the left camera's frame (x right, y down, z forward; metres). The person's textures stand in each
-rigid body's own frame, so that the cloth moves with the limb; all surfaces are Lambertian: the two views
-differ by geometry, gain and noise alone.
+The world is the left camera's frame (x right, y down, z forward; metres). All surfaces are Lambertian: the two
+views differ by geometry, gain and noise alone.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -14,21 +14,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchpose.body.model import BodyModel, PosedBody
-from torchpose.body.superquadric import (
-    DisplayModel,
-    Material,
-    Person,
-    Superquadric,
-    bounding_box,
-    intersect,
-    normals,
-)
+from torchpose.body.superquadric import Person, Superquadric, bounding_box, intersect, normals
+from torchpose.synthesis.actor import Actor
+from torchpose.synthesis.box import Box
 from torchpose.synthesis.motion import random_stream
-from torchpose.synthesis.room import OCTAVES, Room, RoomConfig, SolidTexture, edge_pixels, subpixels
+from torchpose.synthesis.room import Room, RoomConfig, edge_pixels, subpixels
 from torchpose.vision.camera import StereoCamera
-
-CONTRAST = (0.07, 0.22, 0.17, 0.17, 0.20)  # of the texture of each Material
-PRINT = (0.0, 0.0, 0.30, 0.10, 0.0)  # strength of large blots on it
 
 
 @dataclass(frozen=True)
@@ -65,18 +56,19 @@ class StereoFrames:
 
     left: Float[Tensor, "batch 3 height width"]  # RGB in [0, 1]
     right: Float[Tensor, "batch 3 height width"]
-    depth: Float[Tensor, "batch height width"]  # m, of room and person
+    depth: Float[Tensor, "batch height width"]  # m, of room and people
     labels: Int[Tensor, "batch height width"]  # 0 the room, k + 1 segment k
+    people: Int[Tensor, "batch height width"]  # 0 the room, k + 1 the k-th of the people
 
     @property
     def mask(self) -> Bool[Tensor, "batch height width"]:
-        """Where the person is."""
+        """Where anybody is."""
         return self.labels > 0
 
 
 @dataclass(frozen=True)
 class PosedShapes:
-    """One frame's super-quadrics in the frame of one eye."""
+    """One person's super-quadrics at one moment, in the frame of one eye."""
 
     shapes: Superquadric
     rotations: Float[Tensor, "shapes 3 3"]  # R_eye_part
@@ -111,6 +103,14 @@ class PosedShapes:
         if turn is None:
             return PosedShapes(self.shapes, self.rotations, origins)
         return PosedShapes(self.shapes, turn.mT @ self.rotations, origins @ turn)
+
+    def on_parts(
+        self, points: Float[Tensor, "num 3"], part: Int[Tensor, " num"]
+    ) -> tuple[Float[Tensor, "num 3"], Float[Tensor, "num 3"]]:
+        """Points (m, from the eye) on the surfaces of parts, in the parts' frames, and the normals there."""
+        shapes, rotation = self.shapes[part], self.rotations[part]
+        local = ((points - self.origins[part])[..., None] * rotation).sum(-2)  # R^T (p - o)
+        return local, (rotation * normals(local, shapes)[:, None]).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -153,14 +153,20 @@ class _Shadow:
         self.depth = hits.depth.reshape(1, 1, size, size)
         mask = torch.isfinite(self.depth).to(low)
         self.mask = F.avg_pool2d(F.avg_pool2d(mask, 5, 1, 2), 3, 1, 1)
+        self.near = -F.max_pool2d(-self.depth, 9, 1, 4)  # as far as the blurred mask reaches
 
-    def on_room(self, slopes: Float[Tensor, "height width 2"]) -> Float[Tensor, "height width"]:
-        """Share of the lamp that the person hides, softly. The room is behind the person."""
+    def on_room(
+        self, slopes: Float[Tensor, "height width 2"], distance: Float[Tensor, "height width"]
+    ) -> Float[Tensor, "height width"]:
+        """Share of the lamp that the person hides, softly, from the room `distance` m along the lamp's axis."""
         grid = ((slopes - self.middle) / self.half)[None]
-        return F.grid_sample(self.mask, grid, align_corners=False)[0, 0]
+        hidden = F.grid_sample(self.mask, grid, align_corners=False)[0, 0]
+        near = F.grid_sample(self.near.clamp_max(1e3), grid, mode="nearest", align_corners=False)[0, 0]
+        # The floor under a foot is as far as the foot; what stands before the person is nearer by far more.
+        return torch.where(near < distance + 0.15, hidden, 0)
 
-    def on_person(self, points: Float[Tensor, "num 3"]) -> Float[Tensor, " num"]:
-        """Share of the lamp that other parts hide from points of the person (m, in the lamp's frame)."""
+    def on_people(self, points: Float[Tensor, "num 3"]) -> Float[Tensor, " num"]:
+        """Share of the lamp that the person's parts hide from points of people (m, in the lamp's frame)."""
         slopes = (points[:, :2] / points[:, 2:] - self.middle) / self.half
         pixel = 2 / self.depth.shape[-1]
         corners = slopes.new_tensor([[-0.7, -0.7], [0.7, -0.7], [-0.7, 0.7], [0.7, 0.7], [0.0, 0.0]]) * pixel
@@ -171,11 +177,12 @@ class _Shadow:
 
 
 class StereoRenderer(nn.Module):
-    """Renders one person in one room for one stereo camera.
+    """Renders people in one room for one stereo camera.
 
-    The room is cast when the renderer is made, then each frame costs the person and the noise. The noise of
+    The room is cast when the renderer is made, then each frame costs the people and the noise. The noise of
     frame i comes from a random stream of its own, named after `seed` and i, so frames may be rendered in any
-    order and grouping. Raises ValueError for a camera without a baseline.
+    order and grouping. `furniture` stands in the room beside its own. Raises ValueError for a camera without
+    a baseline, and for nobody.
     """
 
     eyes: Tensor
@@ -183,41 +190,38 @@ class StereoRenderer(nn.Module):
     direct: Tensor
     depths: Tensor
     slopes: Tensor
+    from_lamp: Tensor
     lamp: Tensor
     light: Tensor
-    colours: Tensor
-    contrast: Tensor
-    prints: Tensor
-    shifts: Tensor
-    bodies: Tensor
 
     def __init__(
         self,
         camera: StereoCamera,
         body: BodyModel,
-        person: Person,
+        people: Person | Sequence[Person],
         config: RenderConfig = RenderConfig(),
         seed: int | str = 0,
+        furniture: Sequence[Box] = (),
     ):
         super().__init__()
         if camera.baseline is None:
             raise ValueError(
                 "a stereo renderer needs a camera with a baseline, got none; set `baseline` in m"
             )
+        people = (people,) if isinstance(people, Person) else tuple(people)
+        if not people:
+            raise ValueError("a renderer needs at least one person, got none; give one who stays outside")
         self.camera, self.config, self.seed = camera, config, seed
-        self.display = DisplayModel(body, person)
-        self.head = body.body_names.index("head")
-        self.texture = SolidTexture(random_stream("cloth", person.pattern))
+        self.actors = nn.ModuleList([Actor(body, person) for person in people])
         self._constant("eyes", torch.tensor([[0.0, 0, 0], [camera.baseline, 0, 0]]))
         self._constant("light", torch.tensor(config.room.light))
         self._constant("lamp", _looking_at(self.light, self.light.new_tensor([0, 0.1, 3.1])))
-        self._constant("colours", torch.tensor(person.colours))
-        self._constant("contrast", torch.tensor(CONTRAST))
-        self._constant("prints", torch.tensor(PRINT))
-        self._constant("bodies", torch.tensor(self.display.bodies))
-        shifts = torch.rand(len(body.body_names), 3, generator=random_stream("limbs", person.pattern))
-        self._constant("shifts", shifts)  # m: each limb is cut from another place of the cloth
-        self._see_room(Room(config.room, random_stream("room", config.room.seed)))
+        self._see_room(Room(config.room, random_stream("room", config.room.seed), furniture))
+
+    @property
+    def people(self) -> list[Actor]:
+        """Who is drawn, in the order of the poses."""
+        return [actor for actor in self.actors if isinstance(actor, Actor)]
 
     def _constant(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
@@ -233,6 +237,7 @@ class StereoRenderer(nn.Module):
         x, y, z = ((points - self.light) @ self.lamp).unbind(-1)
         slopes = torch.stack((x, y), -1) / z.clamp_min(1e-3)[..., None]
         self._constant("slopes", slopes.reshape(*self.depths.shape, 2))
+        self._constant("from_lamp", z.reshape(self.depths.shape))
 
     @torch.no_grad()
     def background(
@@ -248,48 +253,69 @@ class StereoRenderer(nn.Module):
         return left, right
 
     @torch.no_grad()
-    def forward(self, posed: PosedBody, first_frame: int = 0) -> StereoFrames:
-        """Render the person posed; row i is frame `first_frame + i`, which decides its noise."""
-        parts = self.display(posed)
+    def forward(self, posed: PosedBody | Sequence[PosedBody], first_frame: int = 0) -> StereoFrames:
+        """Render the people posed, one for each; row i is frame `first_frame + i`, which decides its noise."""
+        each = (posed,) if isinstance(posed, PosedBody) else tuple(posed)
+        if len(each) != len(self.people):
+            raise ValueError(
+                f"there must be a pose for each of {len(self.people)} people, got {len(each)}; pose all"
+            )
+        parts = [actor.display(one) for actor, one in zip(self.people, each, strict=True)]
         frames = []
-        for i, (rotations, origins) in enumerate(zip(parts.rotations, parts.origins, strict=True)):
-            scene = PosedShapes(self.display.shapes, rotations, origins)
-            shadow = _Shadow(scene.seen_from(self.light, self.lamp), self.config.shadow_map)
-            (left, depth, labels), (right, _, _) = (self._draw(scene, shadow, eye) for eye in (0, 1))
-            noisy = [
-                self._sense(image, eye, "frame", first_frame + i) for eye, image in enumerate((left, right))
+        for i in range(len(parts[0].origins)):
+            scenes = [
+                PosedShapes(actor.display.shapes, part.rotations[i], part.origins[i])
+                for actor, part in zip(self.people, parts, strict=True)
             ]
-            frames.append((*noisy, depth, labels))
+            shadows = [
+                _Shadow(scene.seen_from(self.light, self.lamp), self.config.shadow_map) for scene in scenes
+            ]
+            views = [self._draw(scenes, shadows, eye) for eye in (0, 1)]
+            noisy = [
+                self._sense(image, eye, "frame", first_frame + i) for eye, (image, *_) in enumerate(views)
+            ]
+            frames.append((*noisy, *views[0][1:]))
         return StereoFrames(*(torch.stack(column) for column in zip(*frames, strict=True)))
 
-    def _draw(self, scene: PosedShapes, shadow: _Shadow, eye: int) -> tuple[Tensor, Tensor, Tensor]:
-        """One view without noise: RGB (3, H, W), depth (H, W) and labels (H, W)."""
-        posed = scene.seen_from(self.eyes[eye])
-        image = self.ambient[eye] + self.direct[eye] * (1 - shadow.on_room(self.slopes[eye]))
+    def _draw(
+        self, scenes: Sequence[PosedShapes], shadows: Sequence[_Shadow], eye: int
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """One view without noise: RGB (3, H, W), depth (H, W), labels (H, W) and whose they are (H, W)."""
+        lit = [1 - shadow.on_room(self.slopes[eye], self.from_lamp[eye]) for shadow in shadows]
+        image = self.ambient[eye] + self.direct[eye] * math.prod(lit[1:], start=lit[0])
         depth = self.depths[eye].clone()
         labels = torch.zeros_like(depth, dtype=torch.long)
-        rows, columns = posed.window(self.camera)
-        pixels, patch, beyond = self._pixels(rows, columns), image[:, rows, columns], depth[rows, columns]
-        size = beyond.shape
-        hits, seen = self._see(posed, shadow, eye, pixels, beyond.flatten(), patch.flatten(1).T)
-        part = hits.part.reshape(size)
-        if self.config.samples > 1:
-            edges = edge_pixels(part).flatten().nonzero()[:, 0]
-            around = pixels[edges][:, None] + subpixels(self.config.samples, pixels)
-            each = around.shape[1]
-            _, fine = self._see(
-                posed,
-                shadow,
-                eye,
-                around.flatten(0, 1),
-                beyond.flatten()[edges].repeat_interleave(each),
-                patch.flatten(1).T[edges].repeat_interleave(each, 0),
-            )
-            seen[edges] = fine.unflatten(0, (len(edges), each)).mean(1)
-        patch.copy_(seen.T.reshape(3, *size))
-        beyond.copy_(torch.where(part >= 0, hits.depth.reshape(size), beyond))
-        labels[rows, columns] = torch.where(part >= 0, self.display.segments[part] + 1, 0)
-        return image, depth, labels
+        people = torch.zeros_like(labels)
+        # The farthest first: the rim of whoever is nearer blends with what is behind it.
+        order = sorted(range(len(scenes)), key=lambda k: -float(scenes[k].origins[:, 2].mean()))
+        for k in order:
+            posed = scenes[k].seen_from(self.eyes[eye])
+            rows, columns = posed.window(self.camera)
+            pixels, patch, beyond = self._pixels(rows, columns), image[:, rows, columns], depth[rows, columns]
+            size = beyond.shape
+            hits, seen = self._see(k, posed, shadows, eye, pixels, beyond.flatten(), patch.flatten(1).T)
+            part = hits.part.reshape(size)
+            if self.config.samples > 1:
+                edges = edge_pixels(part).flatten().nonzero()[:, 0]
+                around = pixels[edges][:, None] + subpixels(self.config.samples, pixels)
+                count = around.shape[1]
+                _, fine = self._see(
+                    k,
+                    posed,
+                    shadows,
+                    eye,
+                    around.flatten(0, 1),
+                    beyond.flatten()[edges].repeat_interleave(count),
+                    patch.flatten(1).T[edges].repeat_interleave(count, 0),
+                )
+                seen[edges] = fine.unflatten(0, (len(edges), count)).mean(1)
+            patch.copy_(seen.T.reshape(3, *size))
+            found = part >= 0
+            beyond.copy_(torch.where(found, hits.depth.reshape(size), beyond))
+            segments = self.people[k].display.segments[part] + 1
+            labels[rows, columns] = torch.where(found, segments, labels[rows, columns])
+            people[rows, columns] = torch.where(found, k + 1, people[rows, columns])
+        return image, depth, labels, people
 
     def _pixels(self, rows: slice, columns: slice) -> Float[Tensor, "num 2"]:
         """Centres (u, v) of the pixels of a window, row by row."""
@@ -298,66 +324,46 @@ class StereoRenderer(nn.Module):
 
     def _see(
         self,
+        index: int,
         posed: PosedShapes,
-        shadow: _Shadow,
+        shadows: Sequence[_Shadow],
         eye: int,
         pixels: Float[Tensor, "num 2"],
-        room_depth: Float[Tensor, " num"],
-        room_colour: Float[Tensor, "num 3"],
+        beyond: Float[Tensor, " num"],
+        colour_beyond: Float[Tensor, "num 3"],
     ) -> tuple[Hits, Float[Tensor, "num 3"]]:
-        """What is seen at pixels: the person where it is nearer than the room, else the room."""
-        rays = self.camera.back_project(pixels, torch.ones_like(room_depth))
+        """What is seen at pixels: the person where it is nearer than what is drawn already, else that."""
+        rays = self.camera.back_project(pixels, torch.ones_like(beyond))
         hits = cast(posed, rays)
-        person = hits.depth < room_depth
+        person = hits.depth < beyond
         hits = Hits(hits.depth, torch.where(person, hits.part, -1))
         points = rays[person] * hits.depth[person][:, None]
-        colour = room_colour.clone()
-        colour[person] = self._shade(posed, shadow, eye, points, hits.part[person])
+        colour = colour_beyond.clone()
+        colour[person] = self._shade(index, posed, shadows, eye, points, hits.part[person])
         return hits, colour
 
     def _shade(
         self,
+        index: int,
         posed: PosedShapes,
-        shadow: _Shadow,
+        shadows: Sequence[_Shadow],
         eye: int,
         points: Float[Tensor, "num 3"],
         part: Int[Tensor, " num"],
     ) -> Float[Tensor, "num 3"]:
-        """RGB of points (m, from the eye) on the parts."""
-        shapes, rotation = posed.shapes[part], posed.rotations[part]
-        local = ((points - posed.origins[part])[..., None] * rotation).sum(-2)  # R^T (p - o)
-        normal = (rotation * normals(local, shapes)[:, None]).sum(-1)
-        on_body = (self.display.frames[part] * local[:, None]).sum(-1) + self.display.offsets[part]
-        albedo = self._albedo(
-            local[:, 2] / shapes.size[:, 2], on_body, part, points[:, 2] / self.camera.focal_length
-        )
+        """RGB of points (m, from the eye) on the parts of a person."""
+        actor = self.people[index]
+        local, normal = posed.on_parts(points, part)
+        albedo = actor.paint(local, part, points[:, 2] / self.camera.focal_length)
         toward = self.light - (points + self.eyes[eye])
         lamp = (F.normalize(toward, dim=-1) * normal).sum(-1).clamp_min(0)
-        lamp = lamp * (1 - shadow.on_person(-toward @ self.lamp))
+        for shadow in shadows:
+            lamp = lamp * (1 - shadow.on_people(-toward @ self.lamp))
         # Light from everywhere is a little stronger from above and from the front, which gives the shaded
         # side its relief.
         around = 0.8 - 0.15 * normal[:, 1] - 0.2 * normal[:, 2]
         room = self.config.room
         return albedo * (room.ambient * around + room.direct * lamp)[:, None]
-
-    def _albedo(
-        self,
-        along: Float[Tensor, " num"],
-        on_body: Float[Tensor, "num 3"],
-        part: Int[Tensor, " num"],
-        footprint: Float[Tensor, " num"],
-    ) -> Float[Tensor, "num 3"]:
-        """RGB reflectance at a share of the part's length and a place in its rigid body's frame (m)."""
-        body = self.bodies[part]
-        material = torch.where(along <= self.display.cuts[part], self.display.materials[part], Material.SKIN)
-        cloth = on_body + self.shifts[body]
-        noise = self.texture(cloth, footprint)
-        blots = self.texture.octave(cloth, len(OCTAVES) - 2)[:, 0]
-        tone = 1 + self.contrast[material] * noise + self.prints[material] * blots
-        colour = self.colours[material] * tone[:, None]
-        face = (body == self.head) & (material == Material.SKIN)
-        painted = colour * _face(on_body / self.display.head_scale)
-        return torch.where(face[:, None], painted, colour).clamp(0.02, 1)
 
     def _sense(
         self, image: Float[Tensor, "3 height width"], eye: int, *names: int | str
@@ -368,28 +374,6 @@ class StereoRenderer(nn.Module):
         noise = torch.randn(image.shape, generator=random_stream("noise", self.seed, eye, *names)).to(image)
         variance = sensor.read_noise**2 + sensor.shot_noise**2 * image.clamp(0, 1)
         return ((image + noise * variance.sqrt()).clamp(0, 1) * 255).round() / 255
-
-
-def _face(at: Float[Tensor, "num 3"]) -> Float[Tensor, "num 3"]:
-    """Factors of the skin's colour for a face painted on the front of the head, at points in its frame at
-    size 1 (m).
-    """
-    x, y, z = at.unbind(-1)
-    side = x.abs()
-
-    def spot(dx: float, dy: float, wide: float, high: float) -> Tensor:
-        """A soft ellipse around (+-dx, dy), 1 inside."""
-        return torch.sigmoid(6 * (1 - ((side - dx) / wide) ** 2 - ((y - dy) / high) ** 2))
-
-    front = torch.sigmoid((-z - 0.035) / 0.008)
-    white, iris = spot(0.031, -0.160, 0.017, 0.008), spot(0.031, -0.160, 0.0075, 0.0085)
-    brow, socket = spot(0.032, -0.181, 0.022, 0.006), spot(0.032, -0.166, 0.026, 0.018)
-    nostril, mouth = spot(0.008, -0.108, 0.006, 0.004), spot(0.0, -0.083, 0.026, 0.0075)
-    factor = (
-        (1 - 0.35 * socket) * (1 + 0.6 * white) * (1 - 0.9 * iris) * (1 - 0.65 * brow) * (1 - 0.5 * nostril)
-    )
-    lips = torch.stack((1 - 0.25 * mouth, 1 - 0.55 * mouth, 1 - 0.5 * mouth), -1)
-    return 1 + front[:, None] * (factor[:, None] * lips - 1)
 
 
 def _looking_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -5,7 +5,7 @@ The world is the left camera's frame (x right, y down, z forward; metres). The c
 agree but for geometry.
 """
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchpose.synthesis.box import Box, Boxes, Vector
 from torchpose.vision.camera import StereoCamera
 
 OCTAVES = (0.006, 0.011, 0.021, 0.041, 0.083, 0.17)  # m, lattice spacings of the textures
 WEIGHTS = (1.7, 1.7, 1.6, 1.2, 0.8, 0.6)  # of the octaves
 TABLE = 48  # lattice points along an edge of the table that the textures are read from
 CHUNK = 1 << 13  # rays at a time: small enough for the processor's cache
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -108,19 +108,6 @@ class RoomView:
     depth: Float[Tensor, "height width"]  # m, at the pixels' centres
 
 
-@dataclass(frozen=True)
-class Box:
-    """A piece of furniture; its size and grain are along its own axes, turned about the vertical."""
-
-    center: Vector  # m
-    size: Vector  # m
-    colour: Vector
-    turn: float = 0.0  # rad
-    contrast: float = 0.1  # of the texture
-    chroma: float = 0.02  # of large coloured blots
-    grain: Vector = (1.0, 1.0, 1.0)  # below 1: the texture is drawn out along that axis
-
-
 def furnish(config: RoomConfig, generator: torch.Generator) -> list[Box]:
     """Cabinets with books, pictures, a skirting board and a crate, left and right of where the person is."""
 
@@ -161,24 +148,24 @@ def furnish(config: RoomConfig, generator: torch.Generator) -> list[Box]:
 
 
 class Room(nn.Module):
-    """A box seen from inside, with furniture. What stands in it and how it looks comes from the generator."""
+    """A box seen from inside, with furniture. What stands in it and how it looks comes from the generator.
+
+    `more` furniture is added to it, and changes nothing else.
+    """
 
     low: Tensor
     high: Tensor
-    centers: Tensor
-    halves: Tensor
-    cosines: Tensor
-    sines: Tensor
     colours: Tensor
     contrasts: Tensor
     chroma: Tensor
     grains: Tensor
     light: Tensor
 
-    def __init__(self, config: RoomConfig, generator: torch.Generator):
+    def __init__(self, config: RoomConfig, generator: torch.Generator, more: Sequence[Box] = ()):
         super().__init__()
         self.config = config
-        boxes = furnish(config, generator)
+        boxes = [*furnish(config, generator), *more]
+        self.furniture = Boxes(boxes)
         self.texture = SolidTexture(generator)
         side, floor = config.width / 2, config.camera_height
         tone = 0.62 + 0.10 * (torch.rand(3, generator=generator) - 0.5)
@@ -186,15 +173,10 @@ class Room(nn.Module):
             [(0.62, 0.60, 0.57)] * 2 + [(0.75, 0.74, 0.72), (0.52, 0.38, 0.26)] + [(0.62, 0.60, 0.57)] * 2
         )
         shell[5] = tone
-        turns = torch.tensor([box.turn for box in boxes])
         along_planks = [(1.0, 1.0, 1.0)] * 3 + [(1.0, 1.0, 0.25)] + [(1.0, 1.0, 1.0)] * 2
         constants = {
             "low": torch.tensor([-side, floor - config.height, -1.0]),
             "high": torch.tensor([side, floor, config.depth]),
-            "centers": torch.tensor([box.center for box in boxes]),
-            "halves": torch.tensor([box.size for box in boxes]) / 2,
-            "cosines": turns.cos(),
-            "sines": turns.sin(),
             "colours": torch.cat((shell, torch.tensor([box.colour for box in boxes]))),
             "contrasts": torch.tensor([0.085] * 6 + [box.contrast for box in boxes]),
             "chroma": torch.tensor([0.01] * 6 + [box.chroma for box in boxes]),
@@ -212,47 +194,13 @@ class Room(nn.Module):
         sign = safe.gather(-1, axis[:, None])[:, 0].sign()
         normal = F.one_hot(axis, 3) * -sign[:, None]
         surface = 2 * axis + (sign > 0)
-        enter, leave, starts = self._slabs(origins, directions)
-        near, box = torch.where((enter < leave) & (enter > 1e-4), enter, math.inf).min(0)
-        pick = box[None]
-        face = torch.stack([start.gather(0, pick)[0] for start in starts], -1).argmax(
-            -1
-        )  # the slab entered last
-        x, y, z = F.one_hot(face, 3).to(normal).unbind(-1)
-        c, s = self.cosines[box], self.sines[box]
-        outward = torch.stack(
-            (c * x + s * z, y, c * z - s * x), -1
-        )  # of one of the two faces across the axis
-        outward = -outward * (outward * directions).sum(-1, keepdim=True).sign()  # the one that faces the ray
+        near, box, outward = self.furniture(origins, directions)
         front = near < distance
         return Hits(
             torch.where(front, near, distance),
             torch.where(front, box + 6, surface),
             torch.where(front[:, None], outward, normal),
         )
-
-    def _slabs(
-        self, origins: Float[Tensor, "num 3"], directions: Float[Tensor, "num 3"]
-    ) -> tuple[Float[Tensor, "boxes num"], Float[Tensor, "boxes num"], list[Float[Tensor, "boxes num"]]]:
-        """Where each ray's line enters and leaves each box (enter > leave: it passes by), and each of its
-        slabs.
-        """
-        x, y, z = (origins.T[:, None] - self.centers.T[..., None]).unbind(
-            0
-        )  # (K, N): the rays last, for speed
-        dx, dy, dz = torch.where(directions.abs() < 1e-9, 1e-9, directions).T
-        c, s = self.cosines[:, None], self.sines[:, None]
-        entries, exits = [], []
-        for axis, (start, ray) in enumerate(
-            ((c * x - s * z, c * dx - s * dz), (y, dy), (s * x + c * z, s * dx + c * dz))
-        ):
-            inverse = 1 / ray
-            middle, reach = start * inverse, self.halves[:, axis, None] * inverse.abs()
-            entries.append(-middle - reach)
-            exits.append(reach - middle)
-        enter = torch.maximum(torch.maximum(entries[0], entries[1]), entries[2])
-        leave = torch.minimum(torch.minimum(exits[0], exits[1]), exits[2])
-        return enter, leave, entries
 
     def brightness(
         self, points: Float[Tensor, "num 3"], normal: Float[Tensor, "num 3"]
@@ -267,8 +215,7 @@ class Room(nn.Module):
         for dx, dz in ((-1, -1), (-1, 1), (1, -1), (1, 1)):  # corners of the lamp
             corner = self.light + self.light.new_tensor([dx * radius, 0, dz * radius])
             start = points + 1e-3 * normal
-            enter, leave, _ = self._slabs(start, corner - start)
-            seen = seen + ~((enter < leave) & (leave > 0) & (enter < 1)).any(0)
+            seen = seen + ~self.furniture.between(start, corner - start)
         return facing * seen / 4
 
     def albedo(
