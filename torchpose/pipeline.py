@@ -3,7 +3,7 @@
 Left-camera frame, metres and radians.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -110,6 +110,15 @@ class StereoToPose(nn.Module):
         self.stopwatch = self.eyes.stopwatch
         self._seen: dict[int, Sight] = {}
 
+    def another(self) -> "StereoToPose":
+        """A model for another person in the same scene: it shares eyes and likelihoods, and knows nothing yet."""
+        other = StereoToPose(self.camera, self.eyes.config, self.config).to(self.device)
+        other.eyes, other.stopwatch = self.eyes, self.stopwatch
+        own = [module for module in other.likelihoods if module is other.colour]
+        shared = [module for module in self.likelihoods if module is not self.colour]
+        other.likelihoods = nn.ModuleList(shared + own)
+        return other
+
     @property
     def device(self) -> torch.device:
         """Where the computing happens."""
@@ -172,7 +181,7 @@ class StereoToPose(nn.Module):
             return size
         for sight, found in fits:
             self.learn_colours(sight, found)
-        if known is not None or self.config.size.rounds == 0:
+        if known is not None:
             return size
         # Once all frames have taught the parts' colours, these speak, too.
         observations = [self.observe(sight) for sight, _ in fits]
@@ -180,10 +189,17 @@ class StereoToPose(nn.Module):
             self.tracker.starter.refresh(observation, found.pose, size)
             for observation, (_, found) in zip(observations, fits, strict=True)
         ]
-        poses = torch.cat([found.pose for found in again])
-        return fit_size(
-            self.tracker.registrar, stack_observations(observations), poses, size, self.config.size
-        )[0]
+        self.size = size
+        return self.fit_size(observations, torch.cat([found.pose for found in again]))
+
+    def fit_size(
+        self, observations: list[Observation], pose: Float[Tensor, "frames parameters"]
+    ) -> Float[Tensor, "1 sizes"]:
+        """The size of the person in these frames, near the one that is now believed; it if sizes are not fitted."""
+        if self.config.size.rounds == 0:
+            return self.size
+        registrar, together = self.tracker.registrar, stack_observations(observations)
+        return fit_size(registrar, together, pose, self.size, self.config.size)[0]
 
     def learn_colours(self, sight: Sight, found: Registration) -> None:
         """Let a frame's fit teach which colours the parts have."""
@@ -313,34 +329,41 @@ class StereoToPose(nn.Module):
 class SmoothingWindow:
     """Frames wait here until those that follow have had their say: pushed one by one, returned smoothed.
 
-    `state` is what a run that was interrupted goes on from: that of the model after the last frame returned.
+    `state` is what a run that was interrupted goes on from: that of the model after the last frame returned, or what
+    `snapshot` gives then.
     """
 
-    def __init__(self, model: StereoToPose, state: Mapping[str, Tensor] | None = None):
+    def __init__(
+        self,
+        model: StereoToPose,
+        state: Mapping[str, Tensor] | None = None,
+        snapshot: Callable[[], dict[str, Tensor]] | None = None,
+    ):
         self.model = model
+        self.snapshot = snapshot or model.state
         self.before = None if not state or "message_pose" not in state else Message.from_state(state)
         self.state: dict[str, Tensor] = {}
         self._next: dict[str, Tensor] = {}
-        self._waiting: list[FramePose] = []
+        self.waiting: list[FramePose] = []
 
     def push(self, frame: FramePose) -> list[FramePose]:
         """Take the next frame; the frames that are ready, often none."""
         config = self.model.config.smoothing
-        self._waiting.append(frame)
-        if len(self._waiting) == config.stretch:
-            self._next = self.model.state()
-        if len(self._waiting) < config.stretch + (config.ahead if config.rounds else 0):
+        self.waiting.append(frame)
+        if len(self.waiting) == config.stretch:
+            self._next = self.snapshot()
+        if len(self.waiting) < config.stretch + (config.ahead if config.rounds else 0):
             return []
         return self._smooth(config.stretch)
 
     def flush(self) -> list[FramePose]:
         """The frames that are left at the end of the recording."""
-        self._next = self.model.state()
-        return self._smooth(len(self._waiting)) if self._waiting else []
+        self._next = self.snapshot()
+        return self._smooth(len(self.waiting)) if self.waiting else []
 
     def _smooth(self, count: int) -> list[FramePose]:
-        smooth, self.before = self.model.smooth(self._waiting, self.before, count - 1)
-        self._waiting = self._waiting[count:]
+        smooth, self.before = self.model.smooth(self.waiting, self.before, count - 1)
+        self.waiting = self.waiting[count:]
         self.state = self._next | ({} if self.before is None else self.before.state())
         return [replace(frame, observation=None) for frame in smooth[:count]]
 

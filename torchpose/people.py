@@ -1,0 +1,425 @@
+"""Everybody in a recording: told apart in each frame, and each followed by a model of his or her own.
+
+Whose pixels are whose is decided by where each body should be; who comes back is known by place and by clothes. Each
+person is located by a filter of head and trunk (T. 4.3.1), which frees the points of artefacts and says where the
+registration starts. Left-camera frame; metres, radians and seconds.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from torchpose.body.model import PosedBody
+from torchpose.eyes import Sight, View
+from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
+from torchpose.recording import Frame, Recording, UnreadableFrame
+from torchpose.registration.vem import Observation, Registration
+from torchpose.tracking.location import Location, LocationConfig, LocationFilter, nowhere, sighting
+from torchpose.tracking.partition import PartitionConfig, split_people
+from torchpose.tracking.tracker import ANSWERED, Person, TrackStatus, track_together
+from torchpose.vision.clump import ArtefactConfig, keep_points, person_points
+from torchpose.vision.colour_histogram import back_projection, colour_histogram, colour_similarity
+from torchpose.vision.faces import FaceMemory
+from torchpose.vision.head import HeadConfig, find_head
+from torchpose.vision.skin import SkinModel
+from torchpose.vision.trunk import TrunkConfig, find_trunk
+
+FACE_TO_HEAD = (0.0, -0.06, 0.08)  # m, from a face's surface to the head's centre, as measured on `people`
+
+
+@dataclass(frozen=True)
+class PeopleConfig:
+    """How people are told apart and located."""
+
+    partition: PartitionConfig = field(default_factory=PartitionConfig)
+    location: LocationConfig = field(default_factory=LocationConfig)
+    head: HeadConfig = field(default_factory=HeadConfig)
+    trunk: TrunkConfig = field(default_factory=TrunkConfig)
+    artefact: ArtefactConfig = field(default_factory=ArtefactConfig)
+    before: float = 0.3  # m by which the scene must be nearer than a person, to hide what lies behind it
+    hidden_parts: int = 2  # of the body, that make a person partly visible
+    memory: float = 2.0  # s for which the location of somebody unseen is believed
+    same_clothes: float = 0.75  # similarity of colours, from which somebody who comes back is the same
+    arrival: int = 3  # frames in which somebody further must be seen, before a pose is sought
+    size_apart: float = 0.4  # s between the frames from which the size is measured on the way
+
+    def __post_init__(self) -> None:
+        for name in ("before", "memory", "size_apart"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.same_clothes <= 1:
+            raise ValueError(f"same_clothes must be a similarity in [0, 1], got {self.same_clothes}")
+        if min(self.hidden_parts, self.arrival) < 1:
+            raise ValueError(
+                f"hidden_parts and arrival must be at least 1, got {self.hidden_parts} and {self.arrival}"
+            )
+
+
+class Follower:
+    """One person: a model of the person's own, and what is known beside the pose."""
+
+    def __init__(self, model: StereoToPose, sized: bool):
+        self.model = model
+        self.location: Location = nowhere(model.size.new_zeros(1, 3))
+        self.clothes: Tensor | None = None  # (1, bins), a running mean
+        self.face: FaceMemory | None = None
+        self.face_time = -math.inf  # s
+        self.seen = 0  # frames with points
+        self.known = False  # whether this person was ever there
+        self.sized = sized
+        self.samples: list[tuple[float, Observation, Registration]] = []  # for the size
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next frame starts from, as tensors."""
+        numbers = torch.tensor([self.seen, self.known, self.sized, self.face_time], dtype=torch.float64)
+        state = self.model.state() | {"follower": numbers}
+        state |= {f"location_{name}": value for name, value in self.location.state().items()}
+        if self.clothes is not None:
+            state["clothes"] = self.clothes
+        if self.face is not None:
+            state |= {"face": self.face.box}
+            state |= {f"skin_{name}": value for name, value in vars(self.face.skin).items()}
+        return {name: value.clone() for name, value in state.items()}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state`; samples for the size are gathered anew."""
+        like = self.model.size
+        self.model.restore(state)
+        seen, known, sized, self.face_time = state["follower"].tolist()
+        self.seen, self.known, self.sized = int(seen), bool(known), bool(sized)
+        where = {
+            name.removeprefix("location_"): value.to(like.device)
+            for name, value in state.items()
+            if name.startswith("location_")
+        }
+        self.location = Location.restore(where)
+        self.clothes = state["clothes"].to(like) if "clothes" in state else None
+        self.face = None
+        if "face" in state:
+            skin = {name[5:]: value.to(like) for name, value in state.items() if name.startswith("skin_")}
+            self.face = FaceMemory(state["face"].to(like), SkinModel(**skin))
+
+
+class People:
+    """Follows everybody in a recording. The first person is the one of the model that is given."""
+
+    def __init__(self, model: StereoToPose, config: PeopleConfig = PeopleConfig()):
+        self.model, self.config = model, config
+        self.filter = LocationFilter(config.location)
+        self.followers = [Follower(model, sized=True)]
+
+    def prepare(self, recording: Recording) -> None:
+        """Learn the recording's empty scene and the size and colours of a person who is alone in it.
+
+        Where nobody is seen alone, sizes are measured on the way.
+        """
+        self.model.prepare(recording)
+        self.followers = [Follower(self.model, sized=True)]
+
+    def __call__(self, recording: Recording) -> Iterator[list[FramePose]]:
+        """Smoothed poses of a prepared recording's frames, in order: those of everybody who was there so far."""
+        windows = PeopleWindows(self)
+        for position in range(len(recording)):
+            yield from windows.push(self.step(recording, position))
+        yield from windows.flush()
+
+    def step(self, recording: Recording, position: int) -> list[FramePose]:
+        """The poses in one frame, the next in order, of everybody known so far; newcomers are added at the end."""
+        try:
+            frame = recording[position]
+        except UnreadableFrame as error:
+            problem = str(error)
+            return [
+                FramePose(error.index, error.time_s, TrackStatus.lost, None, None, problem if first else "")
+                for first in [True] + [False] * (len(self.followers) - 1)
+            ]
+        return self.follow(frame)
+
+    def follow(self, frame: Frame) -> list[FramePose]:
+        """The poses in the next frame."""
+        eyes, time_s = self.model.eyes, frame.time_s
+        view = eyes.look(frame, self.model.device)
+        with self.model.stopwatch.measure("people"):
+            expected = [self._expected(follower, time_s) for follower in self.followers]
+            masks = self._whose(view, expected, time_s)
+            expected += [None] * (len(self.followers) - len(expected))
+        sights = [
+            eyes.sight(view, mask[None], self._face(follower, time_s)) if bool(mask.any()) else None
+            for follower, mask in zip(self.followers, masks, strict=True)
+        ]
+        with self.model.stopwatch.measure("people"):
+            sights = [
+                None if sight is None else self._locate(follower, sight, time_s)
+                for follower, sight in zip(self.followers, sights, strict=True)
+            ]
+            covered = [
+                self._covered(follower, view, masks, k, time_s) for k, follower in enumerate(self.followers)
+            ]
+        with self.model.stopwatch.measure("registration"):
+            asked = []
+            for follower, sight, body, cover in zip(self.followers, sights, expected, covered, strict=True):
+                there = sight is not None and sight.present
+                follower.seen = follower.seen + 1 if there else 0
+                arrived = follower is self.followers[0] or follower.seen >= self.config.arrival
+                follower.known |= there and arrived
+                observation = None
+                if sight is not None and there and (arrived or follower.known):
+                    observation = follower.model.observe(sight, cover)
+                cut = sight is not None and (sight.cut or self._partly(body, cover))
+                asked.append(
+                    Person(
+                        follower.model.tracker,
+                        time_s,
+                        observation,
+                        None if sight is None else sight.faces,
+                        follower.model.size,
+                        cut,
+                        self.filter.pelvis(follower.location) if self._located(follower, time_s) else None,
+                    )
+                )
+            answers = track_together(asked)
+        poses = []
+        for k, (follower, sight, person, tracked) in enumerate(
+            zip(self.followers, sights, asked, answers, strict=True)
+        ):
+            status = tracked.status
+            if status is TrackStatus.absent and sight is not None and sight.present:
+                status = TrackStatus.entering
+            elif status is TrackStatus.absent and self._behind(expected[k], covered[k]):
+                status = TrackStatus.lost
+            if sight is not None and tracked.registration is not None:
+                with self.model.stopwatch.measure("registration"):
+                    follower.model.learn_colours(sight, tracked.registration)
+                    self._learn(follower, sight, person, tracked.registration)
+            poses.append(
+                FramePose(frame.index, time_s, status, tracked.registration, sight, "", person.observation)
+            )
+        return poses
+
+    def _located(self, follower: Follower, time_s: float) -> bool:
+        where = follower.location
+        return bool(where.known[0]) and 0 <= time_s - float(where.time_s[0]) <= self.config.memory
+
+    def _expected(self, follower: Follower, time_s: float) -> PosedBody | None:
+        """Where the person's body should be at `time_s`; None if nobody knows."""
+        model = follower.model
+        place = None
+        if self._located(follower, time_s):
+            place = self.filter.pelvis(self.filter.predict(follower.location, time_s))
+        expected = model.tracker.expect(time_s, place)
+        if expected is not None:
+            return model.body(expected.starts[:1], model.size)
+        if place is None:
+            return None
+        pose = torch.cat([place.mean.to(model.size), model.size.new_zeros(1, 3), model.body.rest[None]], 1)
+        return model.body(pose, model.size)
+
+    def _whose(self, view: View, expected: list[PosedBody | None], time_s: float) -> list[Tensor]:
+        """A mask for each follower; newcomers are followed from now on, or are somebody who comes back."""
+        there = [k for k, body in enumerate(expected) if body is not None]
+        bodies = _together([body for body in expected if body is not None])
+        masks = split_people(
+            view.silhouette[0], view.depth[0], self.model.camera, bodies, self.config.partition
+        )
+        nobody = torch.zeros_like(view.silhouette[0])
+        own = [nobody] * len(self.followers)
+        for k, mask in zip(there, masks, strict=False):
+            own[k] = mask
+        for mask in masks[len(there) :]:
+            free = [k for k in range(len(own)) if not bool(own[k].any())]
+            k = self._who_is(view, mask, free)
+            if k is None:
+                if len(self.followers) >= self.model.eyes.config.people:
+                    continue
+                self.followers.append(Follower(self.model.another(), sized=False))
+                own.append(nobody)
+                k = len(own) - 1
+                self._guess_height(self.followers[k], view, mask)
+            own[k] = mask
+        return own
+
+    def _who_is(self, view: View, mask: Bool[Tensor, "height width"], free: list[int]) -> int | None:
+        """Which of the free followers a newcomer is; None if it is somebody new.
+
+        A first person who was never there is whoever comes first.
+        """
+        unknown = [k for k in free if not self.followers[k].known and self.followers[k].seen == 0]
+        if unknown:
+            return unknown[0]
+        if not view.coloured:
+            return free[0] if len(free) == 1 else None
+        clothes = colour_histogram(view.images, mask[None])
+        best, similar = None, self.config.same_clothes
+        for k in free:
+            worn = self.followers[k].clothes
+            if worn is not None and float(colour_similarity(worn, clothes)[0]) >= similar:
+                best, similar = k, float(colour_similarity(worn, clothes)[0])
+        return best
+
+    def _guess_height(self, follower: Follower, view: View, mask: Bool[Tensor, "height width"]) -> None:
+        """A first size, until frames with poses tell it."""
+        sight = self.model.eyes.sight(view, mask[None], None)
+        follower.model.size = self.model.body.size_of_height(follower.model.measure_height([sight]))
+
+    def _face(self, follower: Follower, time_s: float) -> FaceMemory | None:
+        recent = 0 < time_s - follower.face_time < self.model.eyes.config.memory
+        return follower.face if recent else None
+
+    def _locate(self, follower: Follower, sight: Sight, time_s: float) -> Sight:
+        """Head and trunk go into the filter, and points that are not the person's go out of the sight."""
+        follower.face = sight.faces.memory
+        if follower.face is not None:
+            follower.face_time = time_s
+        if not sight.present:
+            return sight
+        if not self._located(follower, time_s):
+            follower.location = nowhere(follower.location.mean[:, :3])
+        at = self.filter.predict(follower.location, time_s)
+        cloud = sight.cloud
+        weights = cloud.mask.to(cloud.points)
+        if sight.coloured and follower.clothes is not None:
+            u, v = cloud.pixels.round().long().unbind(-1)
+            height, width = sight.images.shape[2:]
+            colours = sight.images[0][:, v.clamp(0, height - 1), u.clamp(0, width - 1)].permute(1, 2, 0)
+            weights = weights * (0.2 + 0.8 * back_projection(colours, follower.clothes))
+        trunk = find_trunk(cloud.points, weights, self.config.trunk, at.body.mean)
+        if bool(sight.faces.found[0]) and bool(sight.faces.position.isfinite().all()):
+            head = sight.faces.position + torch.tensor(FACE_TO_HEAD).to(sight.faces.position)
+            head_sd = torch.full_like(trunk.sd, torch.nan)
+        else:
+            spread = at.head.covariance.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
+            heads = find_head(
+                sight.depth,
+                sight.silhouette,
+                trunk.position,
+                self.model.camera,
+                self.config.head,
+                at.head.mean,
+                spread,
+            )
+            head, head_sd = heads.position, heads.sd
+        seen = sighting(head=head, body=trunk.position, head_sd=head_sd, body_sd=trunk.sd)
+        follower.location = self.filter.step(follower.location, seen, time_s).location
+        place = follower.location
+        sds = (
+            part.covariance.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt() for part in (place.head, place.body)
+        )
+        kept = person_points(cloud, place.head.mean, place.body.mean, *sds, self.config.artefact)
+        cloud = keep_points(cloud, kept)
+        return replace(sight, cloud=cloud, present=int(cloud.mask.sum()) >= self.model.eyes.config.min_points)
+
+    def _covered(
+        self, follower: Follower, view: View, masks: list[Tensor], own: int, time_s: float
+    ) -> Bool[Tensor, "1 height width"] | None:
+        """Where the scene, or somebody else, stands before the person and may hide parts of the body."""
+        if not self._located(follower, time_s):
+            return None
+        distance = float(follower.location.body.mean[0, 2]) - self.config.before
+        scene = self.model.eyes.background_depth
+        covered = torch.zeros_like(view.silhouette)
+        if scene is not None:
+            covered |= (scene < distance)[None]
+        for k, mask in enumerate(masks):
+            if k != own:
+                covered |= (mask & (view.depth[0] < distance))[None]
+        return covered if bool(covered.any()) else None
+
+    def _partly(self, body: PosedBody | None, covered: Tensor | None) -> bool:
+        """Whether parts of the expected body are hidden, or outside of the image."""
+        return body is not None and int(self._unseen(body, covered).sum()) >= self.config.hidden_parts
+
+    def _behind(self, body: PosedBody | None, covered: Tensor | None) -> bool:
+        """Whether nearly all of the expected body is hidden, inside of the image."""
+        if body is None or covered is None:
+            return False
+        return float(self._unseen(body, covered).float().mean()) > 0.7 and not bool(
+            self._outside(body).float().mean() > 0.5
+        )
+
+    def _outside(self, body: PosedBody) -> Bool[Tensor, " parts"]:
+        u, v = self.model.camera.project(body.centers[0]).unbind(-1)
+        camera = self.model.camera
+        return ~((u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5))
+
+    def _unseen(self, body: PosedBody, covered: Tensor | None) -> Bool[Tensor, " parts"]:
+        outside = self._outside(body)
+        if covered is None:
+            return outside
+        u, v = self.model.camera.project(body.centers[0]).nan_to_num(0.0).round().long().unbind(-1)
+        camera = self.model.camera
+        return outside | covered[0, v.clamp(0, camera.height - 1), u.clamp(0, camera.width - 1)]
+
+    def _learn(self, follower: Follower, sight: Sight, person: Person, found: Registration) -> None:
+        """The person's clothes, and the size from the first frames in which all of the person is seen."""
+        if sight.coloured and not person.cut:
+            now = colour_histogram(sight.images, sight.silhouette)
+            follower.clothes = now if follower.clothes is None else 0.95 * follower.clothes + 0.05 * now
+        if follower.sized or person.cut or person.observation is None:
+            return
+        if follower.samples and person.time_s - follower.samples[-1][0] < self.config.size_apart:
+            return
+        follower.samples.append((person.time_s, person.observation, found))
+        if len(follower.samples) == self.model.config.size_frames:
+            follower.model.size = follower.model.fit_size(
+                [observation for _, observation, _ in follower.samples],
+                torch.cat([registration.pose for _, _, registration in follower.samples]),
+            )
+            follower.sized, follower.samples = True, []
+
+    def state(self, person: int) -> dict[str, Tensor]:
+        """What the next frame starts from, of one person."""
+        return self.followers[person].state()
+
+    def restore(self, states: list[Mapping[str, Tensor]]) -> None:
+        """Go on from the states of everybody."""
+        self.followers = [Follower(self.model, sized=True)]
+        self.followers += [Follower(self.model.another(), sized=False) for _ in states[1:]]
+        for follower, state in zip(self.followers, states, strict=True):
+            follower.restore(state)
+
+
+class PeopleWindows:
+    """A smoothing window for each person, which fill and empty together."""
+
+    def __init__(self, people: People, states: list[Mapping[str, Tensor]] | None = None):
+        self.people = people
+        self.windows: list[SmoothingWindow] = []
+        for k, follower in enumerate(people.followers):
+            self.windows.append(
+                SmoothingWindow(follower.model, states[k] if states else None, follower.state)
+            )
+
+    def push(self, poses: list[FramePose]) -> list[list[FramePose]]:
+        """Take the next frame of everybody; the frames that are ready, of everybody, often none."""
+        for k in range(len(self.windows), len(poses)):
+            follower = self.people.followers[k]
+            window = SmoothingWindow(follower.model, None, follower.state)
+            for earlier in self.windows[0].waiting:
+                window.push(replace(earlier, status=TrackStatus.absent, registration=None, sight=None))
+            self.windows.append(window)
+        return _by_frame([window.push(pose) for window, pose in zip(self.windows, poses, strict=True)])
+
+    def flush(self) -> list[list[FramePose]]:
+        """The frames that are left at the end of the recording."""
+        return _by_frame([window.flush() for window in self.windows])
+
+
+def _by_frame(poses: list[list[FramePose]]) -> list[list[FramePose]]:
+    return [list(frame) for frame in zip(*poses, strict=True)]
+
+
+def answered(poses: list[FramePose]) -> int:
+    """How many of the frames have a pose."""
+    return sum(pose.status in ANSWERED for pose in poses)
+
+
+def _together(bodies: list[PosedBody]) -> PosedBody | None:
+    """Bodies of batch 1 as one batch."""
+    if not bodies:
+        return None
+    names = PosedBody.__dataclass_fields__
+    return PosedBody(**{name: torch.cat([getattr(body, name) for body in bodies]) for name in names})
