@@ -38,8 +38,8 @@ class JacobianKind(Enum):
 @dataclass(frozen=True)
 class FittingConfig:
     jacobian: JacobianKind = JacobianKind.geometric
-    # A round's steps: correspondences are renewed in between.
-    lm: LMConfig = field(default_factory=lambda: LMConfig(max_steps=2))
+    # A round's steps: correspondences are renewed in between, and a second one before that gains nothing.
+    lm: LMConfig = field(default_factory=lambda: LMConfig(max_steps=1))
     limit_sd: float = 0.05  # rad beyond a joint's limit that cost as much as one sigma; 0 switches limits off
 
     def __post_init__(self) -> None:
@@ -55,6 +55,8 @@ class Rows:
     local: Float[Tensor, "batch rows 3"]  # m, the model's point in its part's frame
     target: Float[Tensor, "batch rows 3"]  # m, camera's frame
     direction: Float[Tensor, "batch rows 3"]  # 1/m, camera's frame: unit direction / standard deviation
+    # The first 3 T rows are T points' first, then second, then third directions: what repeats is summed once.
+    tripled: int = 0
 
     def points(self, posed: PosedBody) -> Float[Tensor, "batch rows 3"]:
         """The model's points in the camera's frame, m."""
@@ -65,11 +67,34 @@ class Rows:
 
     def residual(self, posed: PosedBody) -> Float[Tensor, "batch rows"]:
         """How far each row is from its target along its direction, no unit."""
-        return (self.direction.mT * (self.target - self.points(posed)).mT).sum(1)
+        once = self.once()
+        gap = (once.target - once.points(posed)).mT
+        direction = self.direction.mT
+        if self.tripled == 0:
+            return (direction * gap).sum(1)
+        T = self.tripled
+        first = direction[..., : 3 * T].unflatten(2, (3, T)) * gap[:, :, None, :T]
+        rest = direction[..., 3 * T :] * gap[..., T:]
+        return torch.cat([first.sum(1).flatten(1), rest.sum(1)], 1)
+
+    def once(self) -> "Rows":
+        """One row of each point: its first."""
+        if self.tripled == 0:
+            return self
+        T = self.tripled
+        return Rows(
+            *(
+                torch.cat([x[:, :T], x[:, 3 * T :]], 1)
+                for x in (self.part, self.local, self.target, self.direction)
+            )
+        )
 
     @staticmethod
-    def cat(*rows: "Rows") -> "Rows":
-        return Rows(*(torch.cat([getattr(r, name) for r in rows], 1) for name in Rows.__dataclass_fields__))
+    def cat(first: "Rows", rest: "Rows") -> "Rows":
+        """Both; `rest` must have no tripled rows."""
+        names = ("part", "local", "target", "direction")
+        both = (torch.cat([getattr(first, name), getattr(rest, name)], 1) for name in names)
+        return Rows(*both, first.tripled)
 
 
 @dataclass(frozen=True)
@@ -185,7 +210,8 @@ def equations_by_moments(
     posed: PosedBody,
 ) -> PoseEquations:
     """The normal equations of rows, prior and limits; the rows are summed once, near where the body is `posed`."""
-    moments = sum_rows(rows.part, rows.local, rows.direction, rows.residual(posed), posed)
+    once = rows.once()
+    moments = sum_rows(once.part, once.local, rows.direction, rows.residual(posed), posed, rows.tripled)
     return PoseEquations(body, size, MomentEquations(moments, body.part_moves), prior, config)
 
 

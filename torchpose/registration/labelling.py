@@ -106,7 +106,9 @@ def neighbour_sum(
     B, L, N = belief.shape
     # Rows of whole vector registers: summing 15 labels takes ten times as long as summing 16.
     width = -(-L // VECTOR) * VECTOR
-    table = torch.nn.functional.pad(belief, (0, 1, 0, width - L)).transpose(1, 2).reshape(B * (N + 1), width)
+    table = torch.nn.functional.pad(belief, (0, 1, 0, width - L)).transpose(1, 2)
+    # In one piece also where a view would do: of a table whose rows are not, the sums take eight times as long.
+    table = table.contiguous().view(B * (N + 1), width)
     first = torch.arange(B, device=belief.device)[:, None, None] * (N + 1)
     bags = (neighbours + first).reshape(B * N, -1)
     summed = torch.nn.functional.embedding_bag(bags, table, mode="sum")
