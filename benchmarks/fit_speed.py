@@ -42,7 +42,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.atomic import replacing
-from torchpose.body.ellipsoid import nearest_point, surface_normal
+from torchpose.body.ellipsoid import NEWTON_STEPS, foot_of_part
 from torchpose.body.model import BodyModel
 from torchpose.least_squares import (
     Linearize,
@@ -213,7 +213,7 @@ class WarmRun:
             for stage in STAGES[:-1]:
                 timed = clock.timed(stage, getattr(self.registrar, stage))
                 stack.enter_context(mock.patch.object(self.registrar, stage, timed))
-            stack.enter_context(mock.patch.object(vem, "fit_pose", clock.timed("fit", vem.fit_pose)))
+            stack.enter_context(mock.patch.object(vem, "fit_posed", clock.timed("fit", vem.fit_posed)))
             for _ in range(repeats):
                 answer = self()
         return {stage: ms / repeats for stage, ms in clock.ms.items()}, answer
@@ -287,9 +287,11 @@ class Problem:
     @property
     def rows(self) -> Rows:
         """Where the places are known: a row for each coordinate of each point."""
-        part, local, points = (x.repeat_interleave(3, 1) for x in (self.part, self.local, self.points))
-        directions = torch.eye(3).to(points).repeat(self.points.shape[1], 1) / SD
-        return Rows(part, local, points, directions.expand_as(points))
+        part, local, points = (
+            x.repeat(1, 3, *[1] * (x.ndim - 2)) for x in (self.part, self.local, self.points)
+        )
+        directions = torch.eye(3).to(points).repeat_interleave(self.points.shape[1], 0) / SD
+        return Rows(part, local, points, directions.expand_as(points), self.points.shape[1])
 
     def fit(self, start: Float[Tensor, "batch parameters"]) -> Solution:
         if self.known:
@@ -299,18 +301,16 @@ class Problem:
     def linearize(self) -> Linearize:
         if self.known:
             return linearize_by_screws(self.body, self.size, self.rows, self.prior, self.config)
-        index, size, prior = self.part[..., None], self.size, self.prior
+        size, prior = self.size, self.prior
 
         def linearize(pose: Tensor) -> tuple[Tensor, Tensor]:
             """A signed distance changes like its foot point along the normal, as if that were fixed to the part."""
             posed = self.body(pose, size)
-            frames = posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3))
-            centers = posed.centers.gather(1, index.expand(-1, -1, 3))
-            radii = posed.radii.gather(1, index.expand(-1, -1, 3))
-            # Every point has an ellipsoid of its own.
-            foot = nearest_point((frames.mT @ (self.points - centers)[..., None]).mT, radii)
-            normal = (frames @ surface_normal(foot, radii).mT)[..., 0]
-            rows = Rows(self.part, foot[:, :, 0], self.points, normal / SD)
+            foot = foot_of_part(posed, self.part[:, None], self.points, False, NEWTON_STEPS)
+            index = self.part[:, None].expand(-1, 9, -1)
+            frames = posed.frames.flatten(2).mT.gather(2, index).unflatten(1, (3, 3))
+            normal = (frames * foot.normal.mT).sum(2).mT
+            rows = Rows(self.part, foot.local[:, 0], self.points, normal / SD)
             return linearize_posed(self.body, pose, posed, rows, prior, self.config)
 
         return linearize

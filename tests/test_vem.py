@@ -7,7 +7,7 @@ import torch
 from synthetic_cloud import CAMERA, mirrored, padded, see, standing, together
 from torch.testing import assert_close
 
-from torchpose.body.ellipsoid import foot_of_part, foot_point, outline, rough_distance
+from torchpose.body.ellipsoid import NEWTON_STEPS, foot_of_part, foot_point, outline, rough_distance
 from torchpose.body.model import BodyConfig, BodyModel, JointKind
 from torchpose.cli import load_config
 from torchpose.least_squares import LMConfig, Status
@@ -192,10 +192,14 @@ def test_the_foot_on_one_part_is_that_of_all_parts(scene, visible):
     starts = torch.cat([off(pose, 10, seed) for seed in range(3)])
     posed, points = body(starts), view.cloud.points.expand(3, -1, -1)
     part = torch.randint(body.num_parts, (3, 2, points.shape[1]))
-    every, own = foot_point(posed, points, visible), foot_of_part(posed, part, points, visible)
+    every = foot_point(posed, points, visible)
+    own = foot_of_part(posed, part, points, visible, NEWTON_STEPS)
+    few = foot_of_part(posed, part, points, visible)  # as registration takes it
+    batch, point = torch.arange(3)[:, None, None], torch.arange(points.shape[1])
     for name in ("local", "normal", "residual", "hidden"):
-        batch, point = torch.arange(3)[:, None, None], torch.arange(points.shape[1])
         assert_close(getattr(own, name), getattr(every, name)[batch, part, point], rtol=0, atol=1e-5)
+    assert_close(few.local, own.local, rtol=0, atol=5e-4)
+    assert_close(few.distance, own.distance, rtol=0, atol=5e-5)
 
 
 def test_a_batch_of_frames_equals_one_by_one():

@@ -96,7 +96,7 @@ def minimize(
     steps = torch.zeros_like(status)
     damping = torch.full_like(loss, config.damping)
     normal = torch.where(finite[:, None, None], normal, 0.0)
-    for _ in range(config.max_steps):
+    for i in range(config.max_steps):
         step, solved = _solve(normal, gradient, damping)
         trial = torch.where(active[:, None], x + step, x)
         trial_loss, trial_gradient, trial_normal = equations(trial)
@@ -115,7 +115,8 @@ def minimize(
         steps = steps + active
         status = torch.where(done, int(Status.CONVERGED), status)
         active = active & ~done
-        if not bool(active.any()):
+        # Asking waits for the device: not after the last step.
+        if i + 1 < config.max_steps and not bool(active.any()):
             break
     return Solution(x, loss, normal, status, steps)
 

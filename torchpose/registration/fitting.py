@@ -115,7 +115,6 @@ def fit_pose(
     rows: Rows,
     prior: PosePrior,
     config: FittingConfig,
-    posed: PosedBody | None = None,
 ) -> Solution:
     """The pose that minimises the rows' squares, the prior's and those of broken limits, from `start`.
 
@@ -127,23 +126,36 @@ def fit_pose(
     Args:
         start: where to begin.
         size: of each person, or of the one.
-        posed: the body at `start`, if it is at hand.
     """
+    return fit_posed(body, start, size, rows, prior, config, body(start, size))[0]
+
+
+def fit_posed(
+    body: BodyModel,
+    start: Float[Tensor, "batch parameters"],
+    size: Float[Tensor, "#batch sizes"],
+    rows: Rows,
+    prior: PosePrior,
+    config: FittingConfig,
+    posed: PosedBody,
+) -> tuple[Solution, PosedBody]:
+    """`fit_pose` where the body at `start` is at hand, `posed`; and the body in the pose that is found."""
     with torch.no_grad():
-        solution = _minimize(body, start, size, rows, prior, config, posed)
+        solution, found = _minimize(body, start, size, rows, prior, config, posed)
     inputs = (size, *_floats(rows).values(), *_floats(prior).values())
     if not (torch.is_grad_enabled() and any(x.requires_grad for x in inputs)):
-        return solution
+        return solution, found
     # A broken row would turn its zeros into NaN on the way back.
     sound = solution.status != int(Status.NON_FINITE)
     value = torch.where(sound[:, None], solution.value, 0.0)
-    size = torch.where(sound[:, None], size, 1.0)
+    sizes = torch.where(sound[:, None], size, 1.0)
     rows, prior = _silenced(rows, ~sound), _silenced(prior, ~sound)
     with torch.no_grad():
-        posed = body(value, size)
-    equations = equations_by_moments(body, size, rows, prior, config, posed)
+        posed = body(value, sizes)
+    equations = equations_by_moments(body, sizes, rows, prior, config, posed)
     value = implicit_value(equations, replace(solution, value=value))
-    return replace(solution, value=torch.where(sound[:, None], value, solution.value))
+    value = torch.where(sound[:, None], value, solution.value)
+    return replace(solution, value=value), body(value, size)
 
 
 def _floats(data: Rows | PosePrior) -> dict[str, Tensor]:
@@ -166,14 +178,24 @@ def _minimize(
     rows: Rows,
     prior: PosePrior,
     config: FittingConfig,
-    posed: PosedBody | None,
-) -> Solution:
+    posed: PosedBody,
+) -> tuple[Solution, PosedBody]:
     if config.jacobian is JacobianKind.autograd:
         equations = normal_equations(linearize_by_autograd(pose_residual(body, size, rows, prior, config)))
-        return minimize(equations, start, config.lm)
-    posed = body(start, size) if posed is None else posed
+        solution = minimize(equations, start, config.lm)
+        return solution, body(solution.value, size)
     by_moments = equations_by_moments(body, size, rows, prior, config, posed)
-    return minimize(by_moments, start, config.lm, by_moments.at(start, posed))
+    tried: list[tuple[Tensor, PosedBody]] = []
+
+    def remembered(pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        tried.append((pose, body(pose, size)))
+        return by_moments.at(*tried[-1])
+
+    solution = minimize(remembered, start, config.lm, by_moments.at(start, posed))
+    # The answer of a row is its start or one of its trials.
+    for pose, there in tried:
+        posed = there.where((pose == solution.value).all(1), posed)
+    return solution, posed
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from torchpose.registration.fitting import (
     PosePrior,
     Rows,
     equations_by_moments,
-    fit_pose,
+    fit_posed,
     pose_terms,
 )
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
@@ -182,20 +182,20 @@ class Registrar(nn.Module):
         rounds = rounds or config.rounds
         sigma_first = sigma_first or config.sigma_first
         pose, bounds = start, []
+        posed = self.body(pose, size)
         status = torch.full((B,), int(Status.MAX_STEPS), device=start.device)
         for i in range(rounds):
             share = i / max(rounds - 1, 1)
             sigma = sigma_first ** (1 - share) * config.sigma_last**share
-            posed = self.body(pose, size)
             foot = self.correspond(posed, observation)
             labelling = self.label(posed, foot, observation, sigma)
             bounds.append(labelling.bound[-1])
             rim = i >= rounds - config.rim.last_rounds
             rows, support = self.rows(posed, foot, labelling, observation, rim)
             full = self.with_rest(prior, support)
-            solution = fit_pose(self.body, pose, size, rows, full, config.fitting, posed)
+            solution, posed = fit_posed(self.body, pose, size, rows, full, config.fitting, posed)
             pose, status = solution.value, solution.status
-        return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status)
+        return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status, posed)
 
     def correspond(self, posed: PosedBody, observation: Observation) -> Correspondence:
         """The model's points that may answer for each data point, and its distances from all parts."""
@@ -309,9 +309,11 @@ class Registrar(nn.Module):
         prior: PosePrior,
         bound: Tensor,
         status: Tensor,
+        posed: PosedBody | None = None,
     ) -> Registration:
+        """What speaks for a pose, with the body `posed` there if it is at hand."""
         config, cloud = self.config, observation.cloud
-        posed = self.body(pose, size)
+        posed = self.body(pose, size) if posed is None else posed
         foot = self.correspond(posed, observation)
         labelling = self.label(posed, foot, observation, config.sigma_last)
         rows, support = self.rows(posed, foot, labelling, observation)
