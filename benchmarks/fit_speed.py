@@ -8,7 +8,7 @@ CPU time on one thread, medians; the rivals take turns. Data: the body in random
 warm      `Registrar.forward` with its defaults from a pose 3 degrees off in every angle and 2 cm off in place, in
           batches: ms a frame, and how they divide. `rows` weighs the points and the silhouette; `fit` is the M-step.
           `joints` is the mean distance of the joints from the true ones, before and after. With `--compile` again with
-          the stages and the body compiled by torch.compile (a minute or more for each batch size).
+          `compile=true` (a minute or more for each batch size).
 cold      One pose of 24 parameters fitted to 600 points whose parts are known, from starts 15 to 35 degrees off in
           every joint (half of that in yaw, pitch and roll, 10 cm in place). `places known`: it is also known where on
           its part each point is, as inside an M-step; the squares of the three coordinates' differences in units of 2
@@ -54,7 +54,6 @@ from torchpose.least_squares import (
     minimize,
     normal_equations,
 )
-from torchpose.registration import vem
 from torchpose.registration.fitting import (
     FittingConfig,
     PosePrior,
@@ -66,7 +65,7 @@ from torchpose.registration.fitting import (
     pose_residual,
 )
 from torchpose.registration.silhouette import nearest_inside
-from torchpose.registration.vem import Observation, Registrar, Registration
+from torchpose.registration.vem import STAGES, Observation, Registrar, Registration, RegistrationConfig
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import SamplingConfig, sample_grid
 
@@ -80,7 +79,6 @@ WITHIN = 1.01  # of the least loss
 AUTOGRAD_LIMIT = 10_000  # points of a batch: more take seconds
 # The default starting damping suits a pose that is nearly right.
 PATIENT = LMConfig(max_steps=50, damping=1e-2, step_tolerance=1e-4, loss_tolerance=1e-4)
-STAGES = ("correspond", "label", "rows", "fit")
 
 
 @dataclass(frozen=True)
@@ -185,14 +183,6 @@ class Clock:
         return run
 
 
-def compile_stages(registrar: Registrar) -> None:
-    """The stages as compiled functions in place of the methods; the loop about them stays as it is."""
-    registrar.body.compile(dynamic=False)
-    # Sigma changes from round to round: where every number is fixed, each would be compiled anew.
-    for stage, dynamic in (("correspond", False), ("label", None), ("rows", False)):
-        setattr(registrar, stage, torch.compile(getattr(registrar, stage), dynamic=dynamic))
-
-
 @dataclass(frozen=True)
 class WarmRun:
     """A registrar, what it is asked, and the answer that would be right."""
@@ -210,10 +200,9 @@ class WarmRun:
         """Milliseconds of each stage, and the answer."""
         clock = Clock()
         with ExitStack() as stack:
-            for stage in STAGES[:-1]:
+            for stage in STAGES:
                 timed = clock.timed(stage, getattr(self.registrar, stage))
                 stack.enter_context(mock.patch.object(self.registrar, stage, timed))
-            stack.enter_context(mock.patch.object(vem, "fit_posed", clock.timed("fit", vem.fit_posed)))
             for _ in range(repeats):
                 answer = self()
         return {stage: ms / repeats for stage, ms in clock.ms.items()}, answer
@@ -224,10 +213,8 @@ def warm_run(batch: int, compiled: bool) -> WarmRun:
     truth = random_poses(body, batch, generator)
     shift = 0.02 * torch.nn.functional.normalize(torch.randn(batch, 3, generator=generator), dim=1)
     turn = math.radians(3) * torch.randn(batch, truth.shape[1] - 3, generator=generator).sign()
-    registrar = Registrar(body)
+    registrar = Registrar(body, RegistrationConfig(compile=compiled))
     observation = observe(body, truth, generator)
-    if compiled:
-        compile_stages(registrar)
     return WarmRun(registrar, observation, truth, truth + torch.cat([shift, turn], 1), compiled)
 
 

@@ -11,6 +11,7 @@ from torchpose.body.ellipsoid import NEWTON_STEPS, foot_of_part, foot_point, out
 from torchpose.body.model import BodyConfig, BodyModel, JointKind
 from torchpose.cli import load_config
 from torchpose.least_squares import LMConfig, Status
+from torchpose.registration import vem
 from torchpose.registration.fitting import FittingConfig, JacobianKind, PosePrior
 from torchpose.registration.geodesic import geodesic_bounds, geodesic_term
 from torchpose.registration.labelling import LabellingConfig
@@ -471,6 +472,51 @@ def test_an_unseen_limb_is_drawn_to_rest_and_a_seen_one_is_not(scene):
     sd = found.covariance[0].diagonal().sqrt()
     right = [i for i, name in enumerate(body.parameter_names) if "arm_right" in name]
     assert (sd[arm] > 2 * sd[right]).all()
+
+
+def test_without_a_compiler_registration_goes_on_with_one_warning(scene, monkeypatch):
+    body, pose, view = scene
+
+    def missing(function):
+        def fail(*_):
+            raise RuntimeError("no g++ here\nand more")
+
+        return fail
+
+    monkeypatch.setattr(torch, "compile", missing)
+    vem.compiling_works.cache_clear()
+    config = RegistrationConfig(compile=True)
+    with pytest.warns(UserWarning, match="compile=true needs a compiler, going on without: no g\\+\\+ here$"):
+        registrar = Registrar(body, config)
+    again = Registrar(body, config)  # no other warning
+    vem.compiling_works.cache_clear()
+    plain = Registrar(body)(view.observation(), pose, body.default_size(1))
+    for compiled in (registrar, again):
+        found = compiled(view.observation(), pose, body.default_size(1))
+        assert torch.equal(found.pose, plain.pose)
+
+
+def test_compiling_takes_the_stages_of_a_round(scene, monkeypatch):
+    """The compiler's stand-in counts what it is given and what runs; real compiling takes minutes."""
+    body, pose, view = scene
+    given, run = [], []
+
+    def counting(function):
+        given.append(function.__name__)
+
+        def counted(*arguments, **named):
+            run.append(function.__name__)
+            return function(*arguments, **named)
+
+        return counted
+
+    monkeypatch.setattr(vem, "compiling_works", lambda device: True)
+    monkeypatch.setattr(torch, "compile", counting)
+    registrar = Registrar(body, RegistrationConfig(compile=True))
+    assert given == list(vem.STAGES)
+    registrar(view.observation(), pose, body.default_size(1))
+    rounds = RegistrationConfig().rounds
+    assert [run.count(stage) for stage in vem.STAGES] == [rounds + 1] * 3 + [rounds]
 
 
 @pytest.mark.parametrize(

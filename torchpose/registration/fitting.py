@@ -7,7 +7,7 @@ have no unit.
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -82,19 +82,20 @@ class Rows:
         if self.tripled == 0:
             return self
         T = self.tripled
-        return Rows(
-            *(
-                torch.cat([x[:, :T], x[:, 3 * T :]], 1)
-                for x in (self.part, self.local, self.target, self.direction)
-            )
+        part, local, target, direction = (
+            torch.cat([x[:, :T], x[:, 3 * T :]], 1)
+            for x in (self.part, self.local, self.target, self.direction)
         )
+        return Rows(part, local, target, direction)
 
     @staticmethod
     def cat(first: "Rows", rest: "Rows") -> "Rows":
         """Both; `rest` must have no tripled rows."""
-        names = ("part", "local", "target", "direction")
-        both = (torch.cat([getattr(first, name), getattr(rest, name)], 1) for name in names)
-        return Rows(*both, first.tripled)
+        part, local, target, direction = (
+            torch.cat([getattr(first, name), getattr(rest, name)], 1)
+            for name in ("part", "local", "target", "direction")
+        )
+        return Rows(part, local, target, direction, first.tripled)
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,7 @@ def _floats(data: Rows | PosePrior) -> dict[str, Tensor]:
 
 def _silenced(data: Given, where: Bool[Tensor, " batch"]) -> Given:
     """With zeros, which say nothing, for some of the batch."""
-    quiet = {
+    quiet: dict[str, Any] = {
         name: torch.where(where.view(-1, *[1] * (x.ndim - 1)), 0.0, x) for name, x in _floats(data).items()
     }
     return replace(data, **quiet)
