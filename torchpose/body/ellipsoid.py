@@ -174,7 +174,7 @@ def foot_point(posed: PosedBody, points: Float[Tensor, "batch num 3"], visible: 
     rim is then nearest, or the point across a flat ellipsoid (there is no third minimum), so the distance stays
     continuous where points cross over; taking the hit of the point's ray instead would make it jump.
     """
-    return _foot_point(to_local(posed, points).mT, _shapes(posed)[..., None], visible)
+    return _foot_point(to_local(posed, points).mT, _shapes(posed, visible)[..., None], visible)
 
 
 def foot_of_part(
@@ -190,7 +190,7 @@ def foot_of_part(
         steps: of Newton's method; with `NEWTON_STEPS` as exact as `foot_point`.
     """
     _, F, N = part.shape
-    every = torch.cat([posed.frames.flatten(2), posed.centers, _shapes(posed)], -1).mT
+    every = torch.cat([posed.frames.flatten(2), posed.centers, _shapes(posed, visible)], -1).mT
     index = part.flatten(1)[:, None].expand(-1, every.shape[1], -1)
     own = every.gather(2, index).unflatten(2, (F, N)).transpose(1, 2)  # (B, F, numbers, N)
     frames, centers, shapes = own.tensor_split((9, 12), 2)
@@ -206,11 +206,12 @@ def _foot_point(
     steps: int = NEWTON_STEPS,
 ) -> FootPoint:
     """Of points in the frames of ellipsoids that either all points of a part share or that are each point's own."""
-    radii, camera, middle, center, axes, rim = shapes.split((3, 3, 3, 3, 6, 2), 2)
+    radii, camera, middle, rims = shapes.tensor_split((3, 6, 9), 2)
     toward = camera / radii
     if visible:
         # The rim is an ellipse, a slice of the ellipsoid of its two half axes: solved beside the others as an ellipsoid
         # of three, in the middle plane of the third.
+        center, axes, rim = rims.split((3, 6, 2), 2)
         axes = axes.unflatten(2, (3, 2))
         aside = (axes * (local - center)[:, :, :, None]).sum(2)
         aside = torch.nn.functional.pad(aside, (0, 0, 0, 1))
@@ -281,16 +282,19 @@ def _rim(posed: PosedBody) -> _Rim:
     return _Rim(camera / square * extent, axes / length[..., None, :], (1 - 1 / square).sqrt() * length)
 
 
-def _shapes(posed: PosedBody) -> Float[Tensor, "batch parts 20"]:
+def _shapes(posed: PosedBody, visible: bool) -> Float[Tensor, "batch parts numbers"]:
     """Of each ellipsoid its half axes, the camera's place, how far from its planes of symmetry `_across` can exist (no
-    further than its centres of curvature are), and the rim's centre, axes and half axes.
+    further than its centres of curvature are), and with `visible` the rim's centre, axes and half axes.
     """
     radii = posed.radii.detach()
     square = radii.square()
     low, middle, _ = square.sort(-1).values.split(1, -1)
     near = torch.where(square > low, square - low, middle - low) / radii
-    rim = _rim(posed)
-    return torch.cat([posed.radii, _camera(posed), near, rim.center, rim.axes.flatten(2), rim.radii], -1)
+    numbers = [posed.radii, _camera(posed), near]
+    if visible:
+        rim = _rim(posed)
+        numbers += [rim.center, rim.axes.flatten(2), rim.radii]
+    return torch.cat(numbers, -1)
 
 
 def _camera(posed: PosedBody) -> Float[Tensor, "batch parts 3"]:
