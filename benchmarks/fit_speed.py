@@ -8,7 +8,7 @@ CPU time on one thread, medians; the rivals take turns. Data: the body in random
 warm      `Registrar.forward` with its defaults from a pose 3 degrees off in every angle and 2 cm off in place, in
           batches: ms a frame, and how they divide. `rows` weighs the points and the silhouette; `fit` is the M-step.
           `joints` is the mean distance of the joints from the true ones, before and after. With `--compile` again with
-          the stages and the body compiled by torch.compile (a minute or more for each batch size).
+          `compile=true` (a minute or more for each batch size).
 cold      One pose of 24 parameters fitted to 600 points whose parts are known, from starts 15 to 35 degrees off in
           every joint (half of that in yaw, pitch and roll, 10 cm in place). `places known`: it is also known where on
           its part each point is, as inside an M-step; the squares of the three coordinates' differences in units of 2
@@ -42,7 +42,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.atomic import replacing
-from torchpose.body.ellipsoid import nearest_point, surface_normal
+from torchpose.body.ellipsoid import NEWTON_STEPS, foot_of_part
 from torchpose.body.model import BodyModel
 from torchpose.least_squares import (
     Linearize,
@@ -54,7 +54,6 @@ from torchpose.least_squares import (
     minimize,
     normal_equations,
 )
-from torchpose.registration import vem
 from torchpose.registration.fitting import (
     FittingConfig,
     PosePrior,
@@ -66,7 +65,7 @@ from torchpose.registration.fitting import (
     pose_residual,
 )
 from torchpose.registration.silhouette import nearest_inside
-from torchpose.registration.vem import Observation, Registrar, Registration
+from torchpose.registration.vem import STAGES, Observation, Registrar, Registration, RegistrationConfig
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import SamplingConfig, sample_grid
 
@@ -80,7 +79,6 @@ WITHIN = 1.01  # of the least loss
 AUTOGRAD_LIMIT = 10_000  # points of a batch: more take seconds
 # The default starting damping suits a pose that is nearly right.
 PATIENT = LMConfig(max_steps=50, damping=1e-2, step_tolerance=1e-4, loss_tolerance=1e-4)
-STAGES = ("correspond", "label", "rows", "fit")
 
 
 @dataclass(frozen=True)
@@ -185,14 +183,6 @@ class Clock:
         return run
 
 
-def compile_stages(registrar: Registrar) -> None:
-    """The stages as compiled functions in place of the methods; the loop about them stays as it is."""
-    registrar.body.compile(dynamic=False)
-    # Sigma changes from round to round: where every number is fixed, each would be compiled anew.
-    for stage, dynamic in (("correspond", False), ("label", None), ("rows", False)):
-        setattr(registrar, stage, torch.compile(getattr(registrar, stage), dynamic=dynamic))
-
-
 @dataclass(frozen=True)
 class WarmRun:
     """A registrar, what it is asked, and the answer that would be right."""
@@ -210,10 +200,9 @@ class WarmRun:
         """Milliseconds of each stage, and the answer."""
         clock = Clock()
         with ExitStack() as stack:
-            for stage in STAGES[:-1]:
+            for stage in STAGES:
                 timed = clock.timed(stage, getattr(self.registrar, stage))
                 stack.enter_context(mock.patch.object(self.registrar, stage, timed))
-            stack.enter_context(mock.patch.object(vem, "fit_pose", clock.timed("fit", vem.fit_pose)))
             for _ in range(repeats):
                 answer = self()
         return {stage: ms / repeats for stage, ms in clock.ms.items()}, answer
@@ -224,10 +213,8 @@ def warm_run(batch: int, compiled: bool) -> WarmRun:
     truth = random_poses(body, batch, generator)
     shift = 0.02 * torch.nn.functional.normalize(torch.randn(batch, 3, generator=generator), dim=1)
     turn = math.radians(3) * torch.randn(batch, truth.shape[1] - 3, generator=generator).sign()
-    registrar = Registrar(body)
+    registrar = Registrar(body, RegistrationConfig(compile=compiled))
     observation = observe(body, truth, generator)
-    if compiled:
-        compile_stages(registrar)
     return WarmRun(registrar, observation, truth, truth + torch.cat([shift, turn], 1), compiled)
 
 
@@ -287,9 +274,11 @@ class Problem:
     @property
     def rows(self) -> Rows:
         """Where the places are known: a row for each coordinate of each point."""
-        part, local, points = (x.repeat_interleave(3, 1) for x in (self.part, self.local, self.points))
-        directions = torch.eye(3).to(points).repeat(self.points.shape[1], 1) / SD
-        return Rows(part, local, points, directions.expand_as(points))
+        part, local, points = (
+            x.repeat(1, 3, *[1] * (x.ndim - 2)) for x in (self.part, self.local, self.points)
+        )
+        directions = torch.eye(3).to(points).repeat_interleave(self.points.shape[1], 0) / SD
+        return Rows(part, local, points, directions.expand_as(points), self.points.shape[1])
 
     def fit(self, start: Float[Tensor, "batch parameters"]) -> Solution:
         if self.known:
@@ -299,18 +288,16 @@ class Problem:
     def linearize(self) -> Linearize:
         if self.known:
             return linearize_by_screws(self.body, self.size, self.rows, self.prior, self.config)
-        index, size, prior = self.part[..., None], self.size, self.prior
+        size, prior = self.size, self.prior
 
         def linearize(pose: Tensor) -> tuple[Tensor, Tensor]:
             """A signed distance changes like its foot point along the normal, as if that were fixed to the part."""
             posed = self.body(pose, size)
-            frames = posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3))
-            centers = posed.centers.gather(1, index.expand(-1, -1, 3))
-            radii = posed.radii.gather(1, index.expand(-1, -1, 3))
-            # Every point has an ellipsoid of its own.
-            foot = nearest_point((frames.mT @ (self.points - centers)[..., None]).mT, radii)
-            normal = (frames @ surface_normal(foot, radii).mT)[..., 0]
-            rows = Rows(self.part, foot[:, :, 0], self.points, normal / SD)
+            foot = foot_of_part(posed, self.part[:, None], self.points, False, NEWTON_STEPS)
+            index = self.part[:, None].expand(-1, 9, -1)
+            frames = posed.frames.flatten(2).mT.gather(2, index).unflatten(1, (3, 3))
+            normal = (frames * foot.normal.mT).sum(2).mT
+            rows = Rows(self.part, foot.local[:, 0], self.points, normal / SD)
             return linearize_posed(self.body, pose, posed, rows, prior, self.config)
 
         return linearize

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from torchpose.body.ellipsoid import (
     foot_point,
     nearest_point,
     outline,
+    rough_distance,
     surface_normal,
     to_camera,
     to_local,
@@ -544,3 +546,43 @@ class TestOutline:
 
         inputs = (base.centers[0].clone().requires_grad_(), base.radii[0].clone().requires_grad_())
         assert torch.autograd.gradcheck(rim, inputs, atol=1e-6)
+
+
+class TestRoughDistance:
+    def test_by_definition(self) -> None:
+        """(|y| - 1) |y| / |y / r| with y = local / r, one pair after another; and the way behind the middle plane."""
+        posed = scene(6)
+        points = around(posed, 10)
+        local = to_local(posed, points)
+        plain, seen = rough_distance(posed, points, visible=False), rough_distance(posed, points)
+        for k in range(6):
+            for n in range(points.shape[1]):
+                y = local[0, k, n] / posed.radii[0, k]
+                level = float(y.norm())
+                first = (level - 1) * level / float((y / posed.radii[0, k]).norm())
+                assert float(plain[0, k, n]) == pytest.approx(first, abs=1e-9)
+                center = posed.centers[0, k]
+                behind = max(0.0, float((points[0, n] - center) @ center / center.norm()))
+                assert float(seen[0, k, n]) == pytest.approx(math.hypot(first, behind), abs=1e-9)
+
+    def test_is_exact_for_spheres_and_to_first_order_beside_a_surface(self) -> None:
+        posed = scene(6)
+        ball = replace(posed, radii=posed.radii[..., :1].expand(-1, -1, 3))
+        points = around(posed, 20)
+        far = (to_local(ball, points).norm(dim=-1) - ball.radii[..., :1]).double()
+        assert_close(rough_distance(ball, points, visible=False), far, atol=1e-9, rtol=0)
+        for away in (1e-2, 1e-3):
+            surface = torch.nn.functional.normalize(torch.randn(1, 6, 20, 3, dtype=F64), dim=-1)
+            foot = surface * posed.radii[:, :, None]
+            local = foot + away * posed.radii.amin() * surface_normal(foot, posed.radii)
+            every = rough_distance(posed, to_camera(posed, local).flatten(1, 2), visible=False)
+            own = every.unflatten(2, (6, 20)).diagonal(dim1=1, dim2=2).mT
+            wanted = away * posed.radii.amin()
+            assert ((own - wanted).abs() < 30 * away * wanted).all()
+
+    def test_single_precision_and_shared_points(self) -> None:
+        posed, single = scene(6), scene(6, torch.float32)
+        points = around(posed, 50)
+        error = rough_distance(single, points.float()) - rough_distance(posed, points)
+        assert error.abs().max() < 1e-4
+        assert_close(rough_distance(repeat(posed, 3), points)[2:], rough_distance(posed, points))

@@ -19,6 +19,7 @@ from torchpose.registration.fitting import (
 )
 
 JOINTS = list(JointKind)
+ROW_FIELDS = ("part", "local", "target", "direction")
 PATIENT = FittingConfig(lm=LMConfig(max_steps=60), limit_sd=0.0)
 
 
@@ -210,7 +211,7 @@ def test_a_batch_equals_one_by_one():
     config = FittingConfig(lm=LMConfig(max_steps=8))
     batch = fit_pose(body, start, size, rows, prior, config).value
     for i in range(3):
-        own = Rows(*(getattr(rows, name)[i : i + 1] for name in Rows.__dataclass_fields__))
+        own = Rows(*(getattr(rows, name)[i : i + 1] for name in ROW_FIELDS))
         alone = PosePrior(prior.mean[i : i + 1], prior.precision[i : i + 1])
         assert_close(
             batch[i : i + 1],

@@ -9,7 +9,6 @@ from synthetic_cloud import RELAXED, see, standing
 from torch import nn
 from torch.testing import assert_close
 
-from torchpose.body.ellipsoid import foot_point
 from torchpose.body.model import BodyModel
 from torchpose.registration.likelihood import (
     AppearanceConfig,
@@ -141,7 +140,7 @@ def frame():
 def test_a_users_likelihood_shifts_the_labels(frame):
     body, pose, view, evidence = frame
     registrar, posed = Registrar(body), body(pose)
-    foot = foot_point(posed, view.cloud.points)
+    foot = registrar.correspond(posed, view.observation())
     mine = HeightLikelihood(body.segment_names)
     observation = view.observation()
     before = registrar.label(posed, foot, observation, 0.05).belief
@@ -156,7 +155,7 @@ def test_a_users_likelihood_learns_through_the_labels(frame):
     """Gradients reach its parameters, and follow them down to the labels that are wanted."""
     body, pose, view, evidence = frame
     registrar, posed = Registrar(body), body(pose)
-    foot = foot_point(posed, view.cloud.points)
+    foot = registrar.correspond(posed, view.observation())
     mine = HeightLikelihood(body.segment_names)
     optimizer = torch.optim.Adam(mine.parameters(), 0.2)
     seen = view.cloud.mask[0]

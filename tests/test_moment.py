@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_fitting import JOINTS, body_of, random_pose, random_size, rows_of
+from test_fitting import JOINTS, ROW_FIELDS, body_of, random_pose, random_size, rows_of
 from torch.testing import assert_close
 
 from torchpose.registration import moment
@@ -41,7 +41,7 @@ def test_a_sum_is_that_of_every_rows_products():
     """By definition, row by row and part by part; the parts' rows come mixed, and part 3 has none."""
     body, truth, size, rows = scene()
     order = torch.randperm(rows.part.shape[1])
-    rows = Rows(*(getattr(rows, name)[:, order] for name in Rows.__dataclass_fields__))
+    rows = Rows(*(getattr(rows, name)[:, order] for name in ROW_FIELDS))
     rows = replace(rows, part=torch.where(rows.part == 3, 5, rows.part))
     posed = body(truth + 0.2, size)
     moments = sums_of(rows, posed)
@@ -78,7 +78,7 @@ def test_the_equations_are_those_of_the_rows_at_any_pose(kind):
 
 
 def row(rows, b):
-    return Rows(*(getattr(rows, name)[b : b + 1] for name in Rows.__dataclass_fields__))
+    return Rows(*(getattr(rows, name)[b : b + 1] for name in ROW_FIELDS))
 
 
 @each_kind
@@ -142,6 +142,29 @@ def test_a_batch_in_chunks_equals_one_by_one(monkeypatch):
         assert_close(alone.matrix[0], whole[b], atol=1e-9, rtol=1e-12)
 
 
+def test_points_with_three_directions_equal_as_many_rows():
+    """Residuals, sums and equations; the points with three directions come first, then others."""
+    body, truth, size, rows = scene(per_part=4)
+    posed = body(truth + 0.1, size)
+    T = 20
+    parts = [getattr(rows, name) for name in ROW_FIELDS[:3]]
+    threefold = [torch.cat([x[:, :T].repeat(1, 3, *[1] * (x.ndim - 2)), x[:, T:]], 1) for x in parts]
+    direction = 50 * torch.randn(*threefold[0].shape, 3, dtype=torch.float64)
+    plain, tripled = Rows(*threefold, direction), Rows(*threefold, direction, tripled=T)
+    assert_close(tripled.residual(posed), plain.residual(posed), atol=1e-12, rtol=1e-12)
+    assert_close(tripled.residual(posed), residual_of(plain, posed), atol=1e-12, rtol=1e-12)
+    nothing = PosePrior(truth, torch.zeros_like(truth))
+    sums = [
+        equations_by_moments(body, size, r, nothing, FittingConfig(), posed).of_rows.moments.matrix
+        for r in (plain, tripled)
+    ]
+    assert_close(sums[1], sums[0], atol=1e-7, rtol=1e-10)
+    rest = Rows(*(getattr(rows, name)[:, :5] for name in ROW_FIELDS))
+    both = Rows.cat(tripled, rest)
+    assert both.tripled == T
+    assert_close(both.residual(posed), torch.cat([plain.residual(posed), rest.residual(posed)], 1))
+
+
 def test_a_broken_frame_stays_alone():
     body, truth, size, rows = scene(batch=3, dtype=torch.float32)
     posed = body(truth, size)
@@ -157,6 +180,6 @@ def test_a_broken_frame_stays_alone():
 
 def test_no_rows_say_nothing():
     body, truth, size, rows = scene()
-    none = Rows(*(getattr(rows, name)[:, :0] for name in Rows.__dataclass_fields__))
+    none = Rows(*(getattr(rows, name)[:, :0] for name in ROW_FIELDS))
     posed = body(truth, size)
     assert (MomentEquations(sums_of(none, posed), body.part_moves)(posed) == 0).all()

@@ -96,13 +96,13 @@ def minimize(
     steps = torch.zeros_like(status)
     damping = torch.full_like(loss, config.damping)
     normal = torch.where(finite[:, None, None], normal, 0.0)
-    for _ in range(config.max_steps):
+    for i in range(config.max_steps):
         step, solved = _solve(normal, gradient, damping)
         trial = torch.where(active[:, None], x + step, x)
         trial_loss, trial_gradient, trial_normal = equations(trial)
         # False where the trial is not finite. A Jacobian that is not would leave no way on: its diagonal
         # tells.
-        better = active & (trial_loss < loss) & _diagonal(trial_normal).isfinite().all(1)
+        better = active & (trial_loss < loss) & (_diagonal(trial_normal).amax(1) < torch.inf)
         small = step.abs().amax(1) < config.step_tolerance
         slow = loss - trial_loss <= config.loss_tolerance * loss
         # A rejected step this small means that the loss cannot be resolved any further.
@@ -115,7 +115,8 @@ def minimize(
         steps = steps + active
         status = torch.where(done, int(Status.CONVERGED), status)
         active = active & ~done
-        if not bool(active.any()):
+        # Asking waits for the device: not after the last step.
+        if i + 1 < config.max_steps and not bool(active.any()):
             break
     return Solution(x, loss, normal, status, steps)
 
@@ -193,5 +194,5 @@ def _solve(normal: Tensor, gradient: Tensor, damping: Tensor) -> tuple[Tensor, T
     floor = diagonal.amax(1, keepdim=True) * torch.finfo(normal.dtype).eps + torch.finfo(normal.dtype).tiny
     factor, failed = torch.linalg.cholesky_ex(normal + torch.diag_embed(damping[:, None] * diagonal + floor))
     step = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-    solved = (failed == 0) & step.isfinite().all(1)
+    solved = (failed == 0) & (step.abs().amax(1) < torch.inf)
     return torch.where(solved[:, None], step, 0.0), solved

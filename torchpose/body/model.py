@@ -47,6 +47,11 @@ class PosedBody:
     screw_axes: Float[Tensor, "batch parameters 3"]
     screw_origins: Float[Tensor, "batch parameters 3"]  # m, a point on it
 
+    def where(self, rows: Bool[Tensor, " batch"], other: "PosedBody") -> "PosedBody":
+        """This body in some rows of the batch, the other one elsewhere."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in PosedBody.__dataclass_fields__)
+        return PosedBody(*(torch.where(rows.view(-1, *[1] * (x.ndim - 1)), x, y) for x, y in pairs))
+
 
 class BodyModel(nn.Module):
     """Forward kinematics of a body file, differentiable in the pose and in the sizes.

@@ -7,7 +7,7 @@ have no unit.
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -38,8 +38,8 @@ class JacobianKind(Enum):
 @dataclass(frozen=True)
 class FittingConfig:
     jacobian: JacobianKind = JacobianKind.geometric
-    # A round's steps: correspondences are renewed in between.
-    lm: LMConfig = field(default_factory=lambda: LMConfig(max_steps=2))
+    # A round's steps: correspondences are renewed in between, and a second one before that gains nothing.
+    lm: LMConfig = field(default_factory=lambda: LMConfig(max_steps=1))
     limit_sd: float = 0.05  # rad beyond a joint's limit that cost as much as one sigma; 0 switches limits off
 
     def __post_init__(self) -> None:
@@ -55,6 +55,8 @@ class Rows:
     local: Float[Tensor, "batch rows 3"]  # m, the model's point in its part's frame
     target: Float[Tensor, "batch rows 3"]  # m, camera's frame
     direction: Float[Tensor, "batch rows 3"]  # 1/m, camera's frame: unit direction / standard deviation
+    # The first 3 T rows are T points' first, then second, then third directions: what repeats is summed once.
+    tripled: int = 0
 
     def points(self, posed: PosedBody) -> Float[Tensor, "batch rows 3"]:
         """The model's points in the camera's frame, m."""
@@ -65,11 +67,35 @@ class Rows:
 
     def residual(self, posed: PosedBody) -> Float[Tensor, "batch rows"]:
         """How far each row is from its target along its direction, no unit."""
-        return (self.direction.mT * (self.target - self.points(posed)).mT).sum(1)
+        once = self.once()
+        gap = (once.target - once.points(posed)).mT
+        direction = self.direction.mT
+        if self.tripled == 0:
+            return (direction * gap).sum(1)
+        T = self.tripled
+        first = direction[..., : 3 * T].unflatten(2, (3, T)) * gap[:, :, None, :T]
+        rest = direction[..., 3 * T :] * gap[..., T:]
+        return torch.cat([first.sum(1).flatten(1), rest.sum(1)], 1)
+
+    def once(self) -> "Rows":
+        """One row of each point: its first."""
+        if self.tripled == 0:
+            return self
+        T = self.tripled
+        part, local, target, direction = (
+            torch.cat([x[:, :T], x[:, 3 * T :]], 1)
+            for x in (self.part, self.local, self.target, self.direction)
+        )
+        return Rows(part, local, target, direction)
 
     @staticmethod
-    def cat(*rows: "Rows") -> "Rows":
-        return Rows(*(torch.cat([getattr(r, name) for r in rows], 1) for name in Rows.__dataclass_fields__))
+    def cat(first: "Rows", rest: "Rows") -> "Rows":
+        """Both; `rest` must have no tripled rows."""
+        part, local, target, direction = (
+            torch.cat([getattr(first, name), getattr(rest, name)], 1)
+            for name in ("part", "local", "target", "direction")
+        )
+        return Rows(part, local, target, direction, first.tripled)
 
 
 @dataclass(frozen=True)
@@ -90,7 +116,6 @@ def fit_pose(
     rows: Rows,
     prior: PosePrior,
     config: FittingConfig,
-    posed: PosedBody | None = None,
 ) -> Solution:
     """The pose that minimises the rows' squares, the prior's and those of broken limits, from `start`.
 
@@ -102,23 +127,36 @@ def fit_pose(
     Args:
         start: where to begin.
         size: of each person, or of the one.
-        posed: the body at `start`, if it is at hand.
     """
+    return fit_posed(body, start, size, rows, prior, config, body(start, size))[0]
+
+
+def fit_posed(
+    body: BodyModel,
+    start: Float[Tensor, "batch parameters"],
+    size: Float[Tensor, "#batch sizes"],
+    rows: Rows,
+    prior: PosePrior,
+    config: FittingConfig,
+    posed: PosedBody,
+) -> tuple[Solution, PosedBody]:
+    """`fit_pose` where the body at `start` is at hand, `posed`; and the body in the pose that is found."""
     with torch.no_grad():
-        solution = _minimize(body, start, size, rows, prior, config, posed)
+        solution, found = _minimize(body, start, size, rows, prior, config, posed)
     inputs = (size, *_floats(rows).values(), *_floats(prior).values())
     if not (torch.is_grad_enabled() and any(x.requires_grad for x in inputs)):
-        return solution
+        return solution, found
     # A broken row would turn its zeros into NaN on the way back.
     sound = solution.status != int(Status.NON_FINITE)
     value = torch.where(sound[:, None], solution.value, 0.0)
-    size = torch.where(sound[:, None], size, 1.0)
+    sizes = torch.where(sound[:, None], size, 1.0)
     rows, prior = _silenced(rows, ~sound), _silenced(prior, ~sound)
     with torch.no_grad():
-        posed = body(value, size)
-    equations = equations_by_moments(body, size, rows, prior, config, posed)
+        posed = body(value, sizes)
+    equations = equations_by_moments(body, sizes, rows, prior, config, posed)
     value = implicit_value(equations, replace(solution, value=value))
-    return replace(solution, value=torch.where(sound[:, None], value, solution.value))
+    value = torch.where(sound[:, None], value, solution.value)
+    return replace(solution, value=value), body(value, size)
 
 
 def _floats(data: Rows | PosePrior) -> dict[str, Tensor]:
@@ -128,7 +166,7 @@ def _floats(data: Rows | PosePrior) -> dict[str, Tensor]:
 
 def _silenced(data: Given, where: Bool[Tensor, " batch"]) -> Given:
     """With zeros, which say nothing, for some of the batch."""
-    quiet = {
+    quiet: dict[str, Any] = {
         name: torch.where(where.view(-1, *[1] * (x.ndim - 1)), 0.0, x) for name, x in _floats(data).items()
     }
     return replace(data, **quiet)
@@ -141,14 +179,24 @@ def _minimize(
     rows: Rows,
     prior: PosePrior,
     config: FittingConfig,
-    posed: PosedBody | None,
-) -> Solution:
+    posed: PosedBody,
+) -> tuple[Solution, PosedBody]:
     if config.jacobian is JacobianKind.autograd:
         equations = normal_equations(linearize_by_autograd(pose_residual(body, size, rows, prior, config)))
-        return minimize(equations, start, config.lm)
-    posed = body(start, size) if posed is None else posed
+        solution = minimize(equations, start, config.lm)
+        return solution, body(solution.value, size)
     by_moments = equations_by_moments(body, size, rows, prior, config, posed)
-    return minimize(by_moments, start, config.lm, by_moments.at(start, posed))
+    tried: list[tuple[Tensor, PosedBody]] = []
+
+    def remembered(pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        tried.append((pose, body(pose, size)))
+        return by_moments.at(*tried[-1])
+
+    solution = minimize(remembered, start, config.lm, by_moments.at(start, posed))
+    # The answer of a row is its start or one of its trials.
+    for pose, there in tried:
+        posed = there.where((pose == solution.value).all(1), posed)
+    return solution, posed
 
 
 @dataclass(frozen=True)
@@ -185,7 +233,8 @@ def equations_by_moments(
     posed: PosedBody,
 ) -> PoseEquations:
     """The normal equations of rows, prior and limits; the rows are summed once, near where the body is `posed`."""
-    moments = sum_rows(rows.part, rows.local, rows.direction, rows.residual(posed), posed)
+    once = rows.once()
+    moments = sum_rows(once.part, once.local, rows.direction, rows.residual(posed), posed, rows.tripled)
     return PoseEquations(body, size, MomentEquations(moments, body.part_moves), prior, config)
 
 

@@ -48,31 +48,37 @@ class Moments:
 
 
 def sum_rows(
-    part: Int[Tensor, "batch rows"],
-    local: Float[Tensor, "batch rows 3"],
+    part: Int[Tensor, "batch points"],
+    local: Float[Tensor, "batch points 3"],
     direction: Float[Tensor, "batch rows 3"],
     residual: Float[Tensor, "batch rows"],
     posed: PosedBody,
+    tripled: int = 0,
 ) -> Moments:
     """The moments of all parts; `residual` is that of each row with the body as `posed`.
 
     Every a is a choice from the products of m = (n, r_0) and h, so the ten of m m^T times the ten of h h^T are
-    summed.
+    summed. A row belongs to the point of its number, but the first `tripled` points have three: their first
+    directions come first, then their second, then their third.
     """
+    K, upper = posed.centers.shape[1], UPPER.to(part.device)
+    m = torch.cat([direction.mT, residual[:, None]], 1)  # (B, 4, R): rows last, each factor in one piece
+    mm = m.index_select(1, upper[0]) * m.index_select(1, upper[1])
+    if tripled > 0:
+        first = mm[..., : 3 * tripled].unflatten(2, (3, tripled)).sum(2)
+        mm = torch.cat([first, mm[..., 3 * tripled :]], 2)
     at_once = max(1, CHUNK // max(part.shape[1], 1))  # frames of the batch
-    chunks = zip(*(x.split(at_once) for x in (part, local, direction, residual)), strict=True)
-    K = posed.centers.shape[1]
-    matrix = torch.cat([_sum_products(p, x, n, r, K) for p, x, n, r in chunks])
+    chunks = zip(*(x.split(at_once) for x in (part, local, mm)), strict=True)
+    matrix = torch.cat([_sum_products(p, x, products, K) for p, x, products in chunks])
     pivot = posed.origins[:, :1]
     return Moments(matrix, _frames(posed, pivot), pivot)
 
 
-def _sum_products(part: Tensor, local: Tensor, direction: Tensor, residual: Tensor, parts: int) -> Tensor:
+def _sum_products(part: Tensor, local: Tensor, mm: Tensor, parts: int) -> Tensor:
     B, R = part.shape
     upper = UPPER.to(part.device)
-    m = torch.cat([direction.mT, residual[:, None]], 1)  # (B, 4, R): rows last, each factor in one piece
-    h = torch.cat([local.mT, torch.ones_like(residual)[:, None]], 1)
-    mm, hh = (x.index_select(1, upper[0]) * x.index_select(1, upper[1]) for x in (m, h))
+    h = torch.cat([local.mT, torch.ones_like(local[..., :1]).mT], 1)
+    hh = h.index_select(1, upper[0]) * h.index_select(1, upper[1])
     products = (mm[:, :, None] * hh[:, None]).flatten(1, 2)  # (B, 100, R)
     member = torch.zeros(B, parts, R, dtype=local.dtype, device=local.device)
     sums = member.scatter(1, part[:, None], 1.0) @ products.mT

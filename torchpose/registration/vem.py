@@ -4,23 +4,25 @@ Left-camera frame; metres and radians. A batch holds frames, or several starts o
 shared by all rows.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.ellipsoid import FootPoint, algebraic_distance, foot_point, rough_distance
+from torchpose.body.ellipsoid import FootPoint, algebraic_distance, foot_of_part, foot_point, rough_distance
 from torchpose.body.model import BodyModel, PosedBody
-from torchpose.least_squares import Status
+from torchpose.least_squares import Solution, Status
 from torchpose.registration.fitting import (
     FittingConfig,
     PosePrior,
     Rows,
     equations_by_moments,
-    fit_pose,
+    fit_posed,
     pose_terms,
 )
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
@@ -28,25 +30,27 @@ from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
 
+STAGES = ("correspond", "label", "rows", "fit")  # the registrar's methods that make up a round
+
 
 class Distance(Enum):
     """What the labels are judged by: metres to the surface, or the cheaper and biased q(X) of (3.3)."""
 
-    first_order = (
-        "first_order"  # metres, `rough_distance` while the pose is sought; the answer is measured exactly
-    )
     euclidean = "euclidean"
     algebraic = "algebraic"
 
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    rounds: int = 5  # VE-steps, each followed by an M-step
+    rounds: int = 3  # VE-steps, each followed by an M-step
     sigma_first: float = 0.10  # m, of the reconstruction term (3.13) in the first round
     sigma_last: float = 0.03  # m, in the last; in between it falls geometrically
     distance: Distance = Distance.euclidean
     visible: bool = True  # correspond with the side that the camera sees
     outlier: float = 3.0  # sigmas beyond which a point rather has no part; 0 gives every point a part
+    near: int = (
+        2  # parts whose foot points a point with a hard label is given; the others are judged to first order
+    )
     hard: bool = True  # each point answers to its best label alone; soft costs 14 times the rows
     tangential: float = 0.3  # weight of the residual along the surface; 1: the distance to a fixed foot
     robust_sd: float = 0.05  # m, at which a residual loses three quarters of its weight; 0 weighs all alike
@@ -54,13 +58,15 @@ class RegistrationConfig:
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
     rest_sd: float = 0.5  # rad, of the pull to the rest pose on joints of which nothing is seen; 0 is none
     rest_support: float = 5.0  # points on a limb that halve this pull
+    compile: bool = False  # by torch.compile: 2 to 3 times as fast at batch 1, after minutes of compiling
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
     rim: RimConfig = field(default_factory=RimConfig)
 
     def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ValueError(f"rounds must be at least 1, got {self.rounds}")
+        for name in ("rounds", "near"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("sigma_first", "sigma_last", "noise_sd", "effective_points", "rest_support"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -142,6 +148,27 @@ class Registration:
         return Registration(**values, bound=bound[None])
 
 
+@dataclass(frozen=True)
+class Correspondence:
+    """The model's points that may answer for each data point, and how far it is from every part."""
+
+    part: Int[Tensor, "batch few num"]  # the parts that these points are on
+    foot: FootPoint  # batch, few, num
+    square: Float[Tensor, "batch parts num"]  # m^2; of other parts than these to first order
+
+
+@cache
+def compiling_works(device: str) -> bool:
+    """Whether torch.compile can make code for this kind of device here; if not, one warning says why."""
+    try:
+        torch.compile(torch.sin)(torch.ones(2, device=device))
+    except Exception as error:  # every backend has its own
+        reason = str(error).strip().splitlines()[0]
+        warnings.warn(f"compile=true needs a compiler, going on without: {reason}", stacklevel=3)
+        return False
+    return True
+
+
 class Registrar(nn.Module):
     """Fits a body to observations from given starts. Everything it knows of a person comes as arguments."""
 
@@ -149,6 +176,9 @@ class Registrar(nn.Module):
         super().__init__()
         self.body = body
         self.config = config
+        if config.compile and compiling_works(body.axes.device.type):
+            for stage in STAGES:
+                setattr(self, stage, torch.compile(getattr(self, stage)))
 
     def forward(
         self,
@@ -172,40 +202,53 @@ class Registrar(nn.Module):
         rounds = rounds or config.rounds
         sigma_first = sigma_first or config.sigma_first
         pose, bounds = start, []
+        posed = self.body(pose, size)
         status = torch.full((B,), int(Status.MAX_STEPS), device=start.device)
         for i in range(rounds):
             share = i / max(rounds - 1, 1)
             sigma = sigma_first ** (1 - share) * config.sigma_last**share
-            posed = self.body(pose, size)
-            # With hard labels at first order only each point's own part needs its foot point: a fourteenth of them.
-            few = config.hard and config.distance is Distance.first_order
-            foot = None if few else self.correspond(posed, observation)
+            foot = self.correspond(posed, observation)
             labelling = self.label(posed, foot, observation, sigma)
             bounds.append(labelling.bound[-1])
             rim = i >= rounds - config.rim.last_rounds
             rows, support = self.rows(posed, foot, labelling, observation, rim)
             full = self.with_rest(prior, support)
-            solution = fit_pose(self.body, pose, size, rows, full, config.fitting, posed)
+            solution, posed = self.fit(pose, size, rows, full, posed)
             pose, status = solution.value, solution.status
-        return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status)
+        return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status, posed)
 
-    def correspond(self, posed: PosedBody, observation: Observation) -> FootPoint:
-        """The model's point that answers for each data point, on every part."""
-        return foot_point(posed, observation.cloud.points, self.config.visible)
+    def fit(
+        self,
+        pose: Float[Tensor, "batch parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        rows: Rows,
+        prior: PosePrior,
+        posed: PosedBody,
+    ) -> tuple[Solution, PosedBody]:
+        """The M-step from `pose`, where the body is `posed`; and the body afterwards."""
+        return fit_posed(self.body, pose, size, rows, prior, self.config.fitting, posed)
+
+    def correspond(self, posed: PosedBody, observation: Observation) -> Correspondence:
+        """The model's points that may answer for each data point, and its distances from all parts."""
+        config, points = self.config, observation.cloud.points
+        K = self.body.num_parts
+        if not config.hard:
+            part = torch.arange(K, device=points.device)[:, None].expand(len(points), K, points.shape[1])
+            foot = foot_point(posed, points, config.visible)
+            return Correspondence(part, foot, foot.residual.square().sum(-1))
+        # A point's label is one of the nearest parts; those far off need no foot point to be told apart from these.
+        rough = rough_distance(posed, points, config.visible).square()
+        part = rough.detach().topk(min(config.near, K), 1, largest=False).indices
+        foot = foot_of_part(posed, part, points, config.visible)
+        return Correspondence(part, foot, rough.scatter(1, part, foot.residual.square().sum(-1)))
 
     def label(
-        self, posed: PosedBody, foot: FootPoint | None, observation: Observation, sigma: float
+        self, posed: PosedBody, foot: Correspondence, observation: Observation, sigma: float
     ) -> Labelling:
-        """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled.
-
-        Without foot points the distances are those to first order.
-        """
+        """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled."""
+        square = foot.square
         if self.config.distance is Distance.algebraic:
-            square = algebraic_distance(posed, observation.cloud.points) ** 2
-        elif foot is None:
-            square = rough_distance(posed, observation.cloud.points, self.config.visible) ** 2
-        else:
-            square = (foot.residual**2).sum(-1)
+            square = algebraic_distance(posed, observation.cloud.points).square()
         potential = observation.potential.mT - square / (2 * sigma**2)
         if self.config.outlier > 0:
             none = torch.full_like(potential[:, :1], -0.5 * self.config.outlier**2)
@@ -218,15 +261,12 @@ class Registrar(nn.Module):
     def rows(
         self,
         posed: PosedBody,
-        foot: FootPoint | None,
+        foot: Correspondence,
         labelling: Labelling,
         observation: Observation,
         rim: bool = True,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part.
-
-        Hard labels need no foot points of all parts: without, those of the points' own parts are found here.
-        """
+        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
         rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.rim)
@@ -240,7 +280,7 @@ class Registrar(nn.Module):
     def _point_rows(
         self,
         posed: PosedBody,
-        foot: FootPoint | None,
+        foot: Correspondence,
         belief: Float[Tensor, "batch labels num"],
         cloud: PointCloud,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
@@ -249,24 +289,19 @@ class Registrar(nn.Module):
         In memory the coordinates stand before the pairs, so that every operation runs along the pairs.
         """
         config, K = self.config, self.body.num_parts
-        B, N = cloud.mask.shape
-        if config.hard or foot is None:
-            best = belief.max(1).indices  # far faster than `argmax`
-            part = best.clamp_max(K - 1)
-            weight = ((best < K) & cloud.mask).to(belief)
-            support = weight.new_zeros(B, K).scatter_add(1, part, weight)
-            own = (
-                foot_of_part(posed, part, cloud.points, config.visible)
-                if foot is None
-                else _of_part(foot, part)
-            )
-            local, normal, gap = own.local[:, 0].mT, own.normal[:, 0].mT, own.residual[:, 0].mT
-            target = cloud.points.mT
-        else:
-            part = torch.arange(K, device=belief.device).repeat_interleave(N).expand(B, -1)
-            weight, support = belief[:, :K].flatten(1), belief[:, :K].sum(2)
-            local, normal, gap = (x.flatten(1, 2).mT for x in (foot.local, foot.normal, foot.residual))
-            target = cloud.points.mT.repeat(1, 1, K)
+        weight = belief.gather(1, foot.part)
+        feet = torch.cat([foot.foot.local, foot.foot.normal, foot.foot.residual], -1).mT  # (B, few, 9, N)
+        part = foot.part
+        if config.hard:
+            best, index = weight.max(1, keepdim=True)  # far faster than `argmax`
+            none = belief[:, K:].amax(1, keepdim=True) if belief.shape[1] > K else torch.zeros_like(best)
+            weight = ((best > none) & cloud.mask[:, None]).to(belief)
+            part = part.gather(1, index)
+            feet = feet.gather(1, index[:, :, None].expand(-1, -1, 9, -1))
+        support = weight.new_zeros(len(part), K, part.shape[2]).scatter(1, part, weight).sum(2)
+        target = cloud.points.mT.repeat(1, 1, part.shape[1])
+        part, weight, feet = part.flatten(1), weight.flatten(1), feet.transpose(1, 2).flatten(2)
+        local, normal, gap = feet.split(3, 1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
         if config.robust_sd > 0:  # Geman and McClure
@@ -283,7 +318,7 @@ class Registrar(nn.Module):
         spread = (1 - config.tangential) * outer + config.tangential * eye  # (B, 3, 3, pairs), symmetric
         direction = (scale[:, None, None] * spread).flatten(2)
         local, target, direction = (x.mT for x in (local.repeat(1, 1, 3), target.repeat(1, 1, 3), direction))
-        return Rows(part.repeat(1, 3), local, target, direction), support
+        return Rows(part.repeat(1, 3), local, target, direction, part.shape[1]), support
 
     def with_rest(self, prior: PosePrior, support: Float[Tensor, "batch parts"]) -> PosePrior:
         """The prior, joined by a pull towards the rest pose on every joint below which little is seen."""
@@ -305,9 +340,11 @@ class Registrar(nn.Module):
         prior: PosePrior,
         bound: Tensor,
         status: Tensor,
+        posed: PosedBody | None = None,
     ) -> Registration:
+        """What speaks for a pose, with the body `posed` there if it is at hand."""
         config, cloud = self.config, observation.cloud
-        posed = self.body(pose, size)
+        posed = self.body(pose, size) if posed is None else posed
         foot = self.correspond(posed, observation)
         labelling = self.label(posed, foot, observation, config.sigma_last)
         rows, support = self.rows(posed, foot, labelling, observation)
@@ -320,7 +357,7 @@ class Registrar(nn.Module):
         eye = torch.eye(pose.shape[1], dtype=pose.dtype, device=pose.device)
         covariance = torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
         count = cloud.mask.sum(1).clamp_min(1)
-        nearest = foot.distance.amin(1) * cloud.mask
+        nearest = foot.foot.distance.amin(1) * cloud.mask
         # Of the rows the points' come first; the bound stands in for them, with every label and none.
         rims = rows.residual(posed)[:, self._point_row_count(cloud) :]
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
@@ -339,40 +376,6 @@ def stack_registrations(found: Sequence[Registration]) -> Registration:
     names = [name for name in Registration.__dataclass_fields__ if name != "bound"]
     values = {name: torch.cat([getattr(one, name) for one in found]) for name in names}
     return Registration(**values, bound=torch.cat([one.bound[-1:] for one in found], 1))
-
-
-def foot_of_part(
-    posed: PosedBody,
-    part: Int[Tensor, "batch num"],
-    points: Float[Tensor, "batch num 3"],
-    visible: bool = True,
-) -> FootPoint:
-    """`foot_point` of each point on one part alone: (B, 1, N) pairs."""
-    B, N = part.shape
-
-    def own(value: Tensor) -> Tensor:
-        flat = value.flatten(2)
-        wide = part[..., None].expand(-1, -1, flat.shape[2])
-        return flat.gather(1, wide).view(B * N, 1, *value.shape[2:])
-
-    # Every point is a batch of its own, with one ellipsoid and nothing else of the body.
-    parts = {name: own(getattr(posed, name)) for name in ("centers", "frames", "radii")}
-    others = {
-        name: x.new_zeros(B * N, 0, *x.shape[2:])
-        for name in PosedBody.__dataclass_fields__
-        if name not in parts and isinstance(x := getattr(posed, name), Tensor)
-    }
-    single = replace(posed, **parts, **others)
-    found = foot_point(single, points.flatten(0, 1)[:, None], visible)
-    local, normal, residual = (x.view(B, 1, N, 3) for x in (found.local, found.normal, found.residual))
-    return FootPoint(local, normal, residual, found.hidden.view(B, 1, N))
-
-
-def _of_part(foot: FootPoint, part: Int[Tensor, "batch num"]) -> FootPoint:
-    pick = part[:, None]
-    wide = pick[:, :, None].expand(-1, -1, 3, -1)
-    local, normal, residual = (x.mT.gather(1, wide).mT for x in (foot.local, foot.normal, foot.residual))
-    return FootPoint(local, normal, residual, foot.hidden.gather(1, pick))
 
 
 def _rows(value: Tensor, batch: int) -> Tensor:
