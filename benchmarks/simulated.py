@@ -153,7 +153,7 @@ def cast_ellipsoids(posed: PosedBody, camera: StereoCamera, scene: Scene) -> Dep
             reach = ((b - (b.square() - a * c).sqrt()) / a).view_as(depth[i])  # NaN where it misses
             seen = reach < depth[i]
             depth[i], labels[i] = reach.where(seen, depth[i]), labels[i].masked_fill(seen, part + 1)
-    return DepthFrames(depth, labels)
+    return DepthFrames(depth, labels, (labels > 0).long())
 
 
 @torch.no_grad()

@@ -116,7 +116,7 @@ def test_full_precision_agrees_with_the_table(result: Path):
 
 def interrupted_at(last: int) -> Callable[..., object]:
     """A step of the pipeline that Ctrl-C ends at this position."""
-    step = tp.StereoToPose.step
+    step = tp.People.step
 
     def interrupted(self, recording, position):
         if position == last:
@@ -133,15 +133,15 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    step = tp.StereoToPose.step
+    step = tp.People.step
     command = [f"recording={folder}", f"output={tmp_path}", *QUICK]
     with monkeypatch.context() as patch:
-        patch.setattr(tp.StereoToPose, "step", interrupted_at(3))
+        patch.setattr(tp.People, "step", interrupted_at(3))
         assert infer_main(command) == 130
     assert "goes on" in capsys.readouterr().err
     assert not (tmp_path / "poses.csv").exists()
     seen = []
-    monkeypatch.setattr(tp.StereoToPose, "step", lambda s, r, p: seen.append(p) or step(s, r, p))
+    monkeypatch.setattr(tp.People, "step", lambda s, r, p: seen.append(p) or step(s, r, p))
     # The output folder is not what makes a run the same: the settings and the recording are.
     assert infer_main(command) == 0
     assert seen == list(range(2, FRAMES))
@@ -151,7 +151,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 
 
 def test_other_settings_start_over(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    model = tp.StereoToPose(tp.open_recording(folder).camera)
+    model = tp.People(tp.StereoToPose(tp.open_recording(folder).camera))
     run = session.Session(model, tp.open_recording(folder), tmp_path, {"a": 1}, "1")
     assert run._resume(fresh=False) == 0
     (run.parts / "poses_00000002.npz").write_bytes(b"")
@@ -260,9 +260,9 @@ def test_a_live_camera_is_recorded_and_then_run(
     assert "recording runs that, and fresh=true or another output records anew" in capsys.readouterr().err
     # An interrupted run goes on with what was recorded, and with nothing that another command recorded.
     command = [*command[: -len(QUICK) - 1], "max_frames=3", *QUICK, "pose.smoothing.ahead=0"]
-    step = tp.StereoToPose.step
+    step = tp.People.step
     with monkeypatch.context() as patch:
-        patch.setattr(tp.StereoToPose, "step", interrupted_at(2))
+        patch.setattr(tp.People, "step", interrupted_at(2))
         assert infer_main([*command, "fresh=true"]) == 130
     assert "the same command again goes on" in capsys.readouterr().err
     assert len(tp.open_recording(tmp_path / "out" / "recording")) == 3
@@ -271,7 +271,7 @@ def test_a_live_camera_is_recorded_and_then_run(
         assert f"got {tmp_path / 'out' / 'recording'} with an earlier one" in capsys.readouterr().err
     opened.clear()
     seen = []
-    monkeypatch.setattr(tp.StereoToPose, "step", lambda s, r, p: seen.append(p) or step(s, r, p))
+    monkeypatch.setattr(tp.People, "step", lambda s, r, p: seen.append(p) or step(s, r, p))
     assert infer_main(command) == 0
     assert (seen, opened) == ([2], [])
     assert f"going on with {tmp_path / 'out' / 'recording'}; fresh=true records" in capsys.readouterr().out

@@ -54,7 +54,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "limb_search",
         "start",
     ),
-    "tracking": ("kalman", "location", "smoother", "tracker"),
+    "tracking": ("kalman", "location", "smoother", "partition", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
         *("inference", "hmm", "codebook", "recognizer", "diary"),
@@ -67,7 +67,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
         *("export", "figures"),
-        *("eyes", "pipeline", "session", "clips", "study", "cli"),
+        *("eyes", "pipeline", "people", "session", "clips", "study", "cli"),
     ),
 }
 ORDER = [

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from sklearn.cluster import MeanShift
 from torch.testing import assert_close
 
-from torchpose.vision.mean_shift import MeanShiftConfig, cam_shift, mean_shift, shift_window
+from torchpose.vision.mean_shift import Kernel, MeanShiftConfig, cam_shift, mean_shift, shift_window
 
 CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1)
 KINDS = ("noise", "ellipse", "one pixel", "sparse", "empty", "two blobs")
@@ -107,7 +107,7 @@ def test_the_flat_kernel_is_scikit_learns():
     for _ in range(5):
         points = cloud(generator)
         start = points[generator.integers(0, len(points), 4)]
-        config = MeanShiftConfig(bandwidth=0.4, kernel="flat", steps=300, tolerance=1e-9)
+        config = MeanShiftConfig(bandwidth=0.4, kernel=Kernel.flat, steps=300, tolerance=1e-9)
         ours = mean_shift(
             torch.from_numpy(points)[None], torch.ones(1, len(points)), torch.from_numpy(start)[None], config
         )
@@ -144,7 +144,7 @@ def test_padding_starts_out_of_reach_and_batches():
     points[~mask] = torch.nan
     start = torch.stack([points[0][mask[0]][:2], points[1][mask[1]][:2], torch.zeros(2, 3).double()])
     start[0, 1] = 100.0
-    config = MeanShiftConfig(bandwidth=0.3, kernel="flat")
+    config = MeanShiftConfig(bandwidth=0.3, kernel=Kernel.flat)
     found = mean_shift(points, mask, start, config)
     assert found.position.isfinite().all(-1).tolist() == [[True, False], [True, True], [False, False]]
     assert found.converged.tolist() == [[True, False], [True, True], [False, False]]

@@ -8,6 +8,7 @@ from torchpose.body.model import BodyConfig, BodyModel, PosedBody
 from torchpose.export import PoseSequence, read_poses_csv, read_poses_npz
 from torchpose.eyes import Eyes, EyesConfig
 from torchpose.least_squares import LMConfig, levenberg_marquardt
+from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Frame, Recording, open_recording, write_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
@@ -46,6 +47,8 @@ __all__ = [
     "MatcherKind",
     "Observation",
     "PartLikelihood",
+    "People",
+    "PeopleConfig",
     "PointCloud",
     "PoseConfig",
     "PoseSequence",

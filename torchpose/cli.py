@@ -20,6 +20,7 @@ from torchpose.aligned import AlignedRecording, align_recording
 from torchpose.capture import camera_numbers, capture_recording, open_cameras
 from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.eyes import EyesConfig
+from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
@@ -65,6 +66,7 @@ class InferConfig:
     threads: int = 1  # of the processor; more help only where cores are idle
     eyes: EyesConfig = field(default_factory=EyesConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
+    people: PeopleConfig = field(default_factory=PeopleConfig)
 
     def __post_init__(self) -> None:
         given = [name for name in ("right", "calibration", "background") if getattr(self, name) is not None]
@@ -181,7 +183,7 @@ def infer(config: InferConfig, device: torch.device) -> None:
             rows_before = recording.alignment.typical * shrunk
     recording = at_most(recording, config.max_width)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    session = Session(model, recording, output, settings, __version__, rows_before)
+    session = Session(People(model, config.people), recording, output, settings, __version__, rows_before)
     print(summary_table(session.run(config.fresh, config.max_frames), output))
 
 

@@ -101,6 +101,11 @@ class PoseSequence:
                 joined[field.name] = None if getattr(first, field.name) is None else torch.cat(values)
         return PoseSequence(**joined)
 
+    def of_nobody(self) -> "PoseSequence":
+        """The same frames of somebody who is not there."""
+        empty = dataclasses.replace(self, status=("absent",) * len(self))
+        return empty.without_stale_numbers()
+
     def without_stale_numbers(self) -> "PoseSequence":
         """The sequence in float64 on the CPU, with NaN in every number of a frame that has no pose."""
         empty = ~torch.tensor(self.answered, dtype=torch.bool)

@@ -6,11 +6,11 @@ registration starts. Left-camera frame; metres, radians and seconds.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body.model import PosedBody
@@ -18,9 +18,10 @@ from torchpose.eyes import Sight, View
 from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
 from torchpose.recording import Frame, Recording, UnreadableFrame
 from torchpose.registration.vem import Observation, Registration
+from torchpose.tracking.kalman import Gaussian
 from torchpose.tracking.location import Location, LocationConfig, LocationFilter, nowhere, sighting
 from torchpose.tracking.partition import PartitionConfig, split_people
-from torchpose.tracking.tracker import ANSWERED, Person, TrackStatus, track_together
+from torchpose.tracking.tracker import Person, TrackStatus, track_together
 from torchpose.vision.clump import ArtefactConfig, keep_points, person_points
 from torchpose.vision.colour_histogram import back_projection, colour_histogram, colour_similarity
 from torchpose.vision.faces import FaceMemory
@@ -117,8 +118,16 @@ class People:
 
         Where nobody is seen alone, sizes are measured on the way.
         """
-        self.model.prepare(recording)
-        self.followers = [Follower(self.model, sized=True)]
+        seen = self.model.prepare(recording, self._alone)
+        self.followers = [Follower(self.model, sized=seen or bool(self.model.config.person))]
+
+    def _alone(self, frame: Frame) -> Sight | None:
+        """Whoever is in a frame with nobody else."""
+        view = self.model.eyes.look(frame, self.model.device)
+        masks = split_people(
+            view.silhouette[0], view.depth[0], self.model.camera, None, self.config.partition
+        )
+        return self.model.eyes.sight(view, masks, None) if len(masks) == 1 else None
 
     def __call__(self, recording: Recording) -> Iterator[list[FramePose]]:
         """Smoothed poses of a prepared recording's frames, in order: those of everybody who was there so far."""
@@ -231,15 +240,15 @@ class People:
             own[k] = mask
         for mask in masks[len(there) :]:
             free = [k for k in range(len(own)) if not bool(own[k].any())]
-            k = self._who_is(view, mask, free)
-            if k is None:
+            who = self._who_is(view, mask, free)
+            if who is None:
                 if len(self.followers) >= self.model.eyes.config.people:
                     continue
                 self.followers.append(Follower(self.model.another(), sized=False))
                 own.append(nobody)
-                k = len(own) - 1
-                self._guess_height(self.followers[k], view, mask)
-            own[k] = mask
+                who = len(own) - 1
+                self._guess_height(self.followers[who], view, mask)
+            own[who] = mask
         return own
 
     def _who_is(self, view: View, mask: Bool[Tensor, "height width"], free: list[int]) -> int | None:
@@ -291,7 +300,6 @@ class People:
             head = sight.faces.position + torch.tensor(FACE_TO_HEAD).to(sight.faces.position)
             head_sd = torch.full_like(trunk.sd, torch.nan)
         else:
-            spread = at.head.covariance.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
             heads = find_head(
                 sight.depth,
                 sight.silhouette,
@@ -299,15 +307,13 @@ class People:
                 self.model.camera,
                 self.config.head,
                 at.head.mean,
-                spread,
+                _spread(at.head),
             )
             head, head_sd = heads.position, heads.sd
         seen = sighting(head=head, body=trunk.position, head_sd=head_sd, body_sd=trunk.sd)
         follower.location = self.filter.step(follower.location, seen, time_s).location
         place = follower.location
-        sds = (
-            part.covariance.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt() for part in (place.head, place.body)
-        )
+        sds = _spread(place.head), _spread(place.body)
         kept = person_points(cloud, place.head.mean, place.body.mean, *sds, self.config.artefact)
         cloud = keep_points(cloud, kept)
         return replace(sight, cloud=cloud, present=int(cloud.mask.sum()) >= self.model.eyes.config.min_points)
@@ -370,11 +376,7 @@ class People:
             )
             follower.sized, follower.samples = True, []
 
-    def state(self, person: int) -> dict[str, Tensor]:
-        """What the next frame starts from, of one person."""
-        return self.followers[person].state()
-
-    def restore(self, states: list[Mapping[str, Tensor]]) -> None:
+    def restore(self, states: Sequence[Mapping[str, Tensor]]) -> None:
         """Go on from the states of everybody."""
         self.followers = [Follower(self.model, sized=True)]
         self.followers += [Follower(self.model.another(), sized=False) for _ in states[1:]]
@@ -385,7 +387,7 @@ class People:
 class PeopleWindows:
     """A smoothing window for each person, which fill and empty together."""
 
-    def __init__(self, people: People, states: list[Mapping[str, Tensor]] | None = None):
+    def __init__(self, people: People, states: Sequence[Mapping[str, Tensor]] | None = None):
         self.people = people
         self.windows: list[SmoothingWindow] = []
         for k, follower in enumerate(people.followers):
@@ -398,8 +400,11 @@ class PeopleWindows:
         for k in range(len(self.windows), len(poses)):
             follower = self.people.followers[k]
             window = SmoothingWindow(follower.model, None, follower.state)
-            for earlier in self.windows[0].waiting:
-                window.push(replace(earlier, status=TrackStatus.absent, registration=None, sight=None))
+            # Not pushed: of a time before somebody came there is no state to go on from.
+            window.waiting = [
+                replace(earlier, status=TrackStatus.absent, registration=None, sight=None, observation=None)
+                for earlier in self.windows[0].waiting
+            ]
             self.windows.append(window)
         return _by_frame([window.push(pose) for window, pose in zip(self.windows, poses, strict=True)])
 
@@ -408,13 +413,13 @@ class PeopleWindows:
         return _by_frame([window.flush() for window in self.windows])
 
 
+def _spread(place: Gaussian) -> Float[Tensor, " batch"]:
+    """The greatest standard deviation of a place's coordinates, m."""
+    return place.covariance.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
+
+
 def _by_frame(poses: list[list[FramePose]]) -> list[list[FramePose]]:
     return [list(frame) for frame in zip(*poses, strict=True)]
-
-
-def answered(poses: list[FramePose]) -> int:
-    """How many of the frames have a pose."""
-    return sum(pose.status in ANSWERED for pose in poses)
 
 
 def _together(bodies: list[PosedBody]) -> PosedBody | None:

@@ -108,15 +108,14 @@ class StereoToPose(nn.Module):
         self.smoother = Smoother(self.body, registrar, config.smoothing)
         self.register_buffer("size", self.body.default_size(1), persistent=False)
         self.stopwatch = self.eyes.stopwatch
-        self._seen: dict[int, Sight] = {}
 
     def another(self) -> "StereoToPose":
         """A model for another person in the same scene: it shares eyes and likelihoods, and knows nothing yet."""
         other = StereoToPose(self.camera, self.eyes.config, self.config).to(self.device)
         other.eyes, other.stopwatch = self.eyes, self.stopwatch
-        own = [module for module in other.likelihoods if module is other.colour]
-        shared = [module for module in self.likelihoods if module is not self.colour]
-        other.likelihoods = nn.ModuleList(shared + own)
+        other.likelihoods = nn.ModuleList(
+            [other.colour if module is self.colour else module for module in self.likelihoods]
+        )
         return other
 
     @property
@@ -145,18 +144,23 @@ class StereoToPose(nn.Module):
         """Learn the empty scene of the recording."""
         self.eyes.learn_background(recording.background(), recording, self.device)
 
-    def prepare(self, recording: Recording) -> None:
-        """Learn the recording's empty scene and the person's size and colours, and forget any other person."""
+    def prepare(self, recording: Recording, glance: Callable[[Frame], Sight | None] | None = None) -> bool:
+        """Learn the recording's empty scene and the person's size and colours, and forget any other person.
+
+        `glance` says whom a frame shows, None where that is not clear; without it the largest silhouette is the
+        person's. Returns whether anybody was seen.
+        """
         known = read_size(Path(self.config.person), self.body) if self.config.person else None
         self.learn_background(recording)
         self.tracker.forget()
         self.eyes.last = None
         self.colour.forget()
         frames = readable_frames(recording, spread_positions(len(recording), self.config.size_frames))
-        # These frames come again in their turn; what was seen of them is kept until then.
-        self._seen = {frame.index: self.eyes(frame, self.device) for frame in frames}
+        look = glance or (lambda frame: self.eyes(frame, self.device))
+        sights = [sight for sight in map(look, frames) if sight is not None]
         with self.stopwatch.measure("size"):
-            self.size = self.measure_size(list(self._seen.values()), known)
+            self.size = self.measure_size(sights, known)
+        return any(sight.present for sight in sights)
 
     def measure_size(
         self, sights: list[Sight], known: Float[Tensor, "1 sizes"] | None = None
@@ -236,9 +240,7 @@ class StereoToPose(nn.Module):
 
     def follow(self, frame: Frame) -> FramePose:
         """The next frame's pose."""
-        sight = self._seen.pop(frame.index, None)
-        if sight is None:
-            sight = self.eyes(frame, self.device)
+        sight = self.eyes(frame, self.device)
         with self.stopwatch.measure("registration"):
             observation = self.observe(sight) if sight.present else None
             tracked = self.tracker(frame.time_s, observation, sight.faces, self.size, sight.cut)

@@ -35,12 +35,14 @@ from torchpose.export import (
 )
 from torchpose.eyes import depth_picture
 from torchpose.figures import Overlay, draw_overlay, plot_angles
-from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
+from torchpose.people import People, PeopleWindows
+from torchpose.pipeline import FramePose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
 from torchpose.registration.size import write_size
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 
 CHECKED = 3  # frames whose rows are compared
+FEWEST = 5  # frames with a pose, from which somebody further is written
 _PARTS, _STAMP = "parts", "settings.txt"  # of a run that is not finished: their folder, and whose they are
 _SHOWN = ("elbow_flexion_left", "elbow_flexion_right", "knee_flexion_left", "knee_flexion_right")
 
@@ -62,18 +64,19 @@ class Session:
 
     def __init__(
         self,
-        model: StereoToPose,
+        people: People,
         recording: Recording,
         output: Path,
         settings: Mapping[str, Any],
         version: str,
         rows_before: float | None = None,
     ):
-        self.model, self.recording, self.output = model, recording, output
+        self.people, self.model = people, people.model
+        self.recording, self.output = recording, output
         self.settings, self.version, self.rows_before = settings, version, rows_before
         self.parts = output / _PARTS
         self.problems: list[str] = []
-        self.kept: dict[str, Tensor] = {}  # what an interrupted run goes on from
+        self.kept: list[dict[str, Tensor]] = []  # what an interrupted run goes on from, of each person
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
         """Recover all poses and write the files of an output folder.
@@ -84,16 +87,21 @@ class Session:
         done = self._resume(fresh)
         rows_apart = self._check_rows()
         if done < count:
-            self.model.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
+            self.people.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
             self._follow(done, count)
-        sequence, labelled = self._collect()
+        found = self._collect()
         with self.model.stopwatch.measure("export"):
-            write_poses_csv(self.output / "poses.csv", sequence)
-            write_poses_npz(self.output / "poses.npz", sequence)
-            plot_angles(self.output / "angles.png", sequence)
-            write_size(self.output / "person.yaml", self.model.body, self.model.size)
-            self._draw(sequence, labelled)
+            for number, (sequence, _, person) in enumerate(found, 1):
+                mark = "" if number == 1 else f"_{number}"
+                write_poses_csv(self.output / f"poses{mark}.csv", sequence)
+                write_poses_npz(self.output / f"poses{mark}.npz", sequence)
+                plot_angles(self.output / f"angles{mark}.png", sequence)
+                size = self.people.followers[person].model.size
+                write_size(self.output / f"person{mark}.yaml", self.model.body, size)
+            self._draw(found)
+        sequence = found[0][0]
         summary = self._summary(sequence, time.perf_counter() - begin, count - done)
+        summary["others"] = [dict(Counter(other.status)) for other, _, _ in found[1:]]
         summary |= {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before}
         write_summary(self.output / "summary.json", summary)
         shutil.rmtree(self.parts)
@@ -129,34 +137,50 @@ class Session:
         files = self._files()
         if not files:
             return 0
-        state = np.load(files[-1].with_name(files[-1].name.replace("poses", "state")))
-        self.kept = {name: torch.from_numpy(state[name]) for name in state.files}
-        self.model.restore(self.kept)
+        # The first person's part is written last: what others have beyond it is of a stretch that was not finished.
+        for person in range(self._count()):
+            state = self._folder(person) / files[-1].name.replace("poses", "state")
+            if state.exists():
+                saved = np.load(state)
+                self.kept.append({name: torch.from_numpy(saved[name]) for name in saved.files})
+        self.people.restore(self.kept)
         return sum(len(read_poses_npz(file)) for file in files)
+
+    def _folder(self, person: int) -> Path:
+        """Where the parts of a person are, counted from 0."""
+        return self.parts if person == 0 else self.parts / f"person_{person + 1}"
+
+    def _count(self) -> int:
+        """How many people have parts."""
+        return 1 + len(list(self.parts.glob("person_*")))
 
     def _files(self) -> list[Path]:
         return sorted(self.parts.glob("poses_*.npz"))
 
     def _follow(self, done: int, count: int) -> None:
         """Frames `done` to `count`, saved whenever a stretch of them is smooth."""
-        window = SmoothingWindow(self.model, self.kept)
+        windows = PeopleWindows(self.people, self.kept)
         with tqdm(
             total=count, initial=done, unit="frame", disable=not sys.stderr.isatty(), leave=False
         ) as bar:
             for position in range(done, count):
-                result = self.model.step(self.recording, position)
-                if result.problem:
-                    self.problems.append(f"frame {result.index}: {result.problem}")
-                ready = window.push(result)
-                ready += window.flush() if position == count - 1 else []
-                bar.set_postfix_str(result.status.value)
+                result = self.people.step(self.recording, position)
+                if result[0].problem:
+                    self.problems.append(f"frame {result[0].index}: {result[0].problem}")
+                ready = windows.push(result)
+                ready += windows.flush() if position == count - 1 else []
+                bar.set_postfix_str(result[0].status.value)
                 bar.update()
                 if ready:
                     done += len(ready)
-                    self._save(done, ready, window.state)
+                    for person in reversed(range(len(windows.windows))):
+                        state = windows.windows[person].state
+                        if state:
+                            self._save(person, done, [frame[person] for frame in ready], state)
 
-    def _save(self, end: int, frames: list[FramePose], kept: Mapping[str, Tensor]) -> None:
-        """One part: poses, labelled points, and last what the next frame starts from."""
+    def _save(self, person: int, end: int, frames: list[FramePose], kept: Mapping[str, Tensor]) -> None:
+        """One part of a person: labelled points, what the next frame starts from, and last the poses."""
+        folder = self._folder(person)
         num = max((f.sight.cloud.mask.shape[1] for f in frames if f.sight is not None), default=1)
         pixels, labels = (
             np.full((len(frames), num, 2), np.nan, np.float32),
@@ -167,42 +191,81 @@ class Session:
                 seen = frame.sight.cloud.mask[0].cpu()
                 pixels[i, seen] = frame.sight.cloud.pixels[0].cpu()[seen]
                 labels[i, seen] = frame.registration.belief[0].argmax(0).cpu()[seen]
-        with replacing(self.parts / f"points_{end:08d}.npz") as partial:
+        with replacing(folder / f"points_{end:08d}.npz") as partial:
             np.savez(partial, pixels=pixels, labels=labels)
         state = {name: value.cpu().numpy() for name, value in kept.items()}
-        with replacing(self.parts / f"state_{end:08d}.npz") as partial:
+        with replacing(folder / f"state_{end:08d}.npz") as partial:
             np.savez_compressed(partial, allow_pickle=False, **state)
-        write_poses_npz(self.parts / f"poses_{end:08d}.npz", self.model.sequence(frames))
+        model = self.people.followers[person].model
+        write_poses_npz(folder / f"poses_{end:08d}.npz", model.sequence(frames))
 
-    def _collect(self) -> tuple[PoseSequence, _Labelled]:
-        files = self._files()
-        sequence = PoseSequence.join([read_poses_npz(file) for file in files])
-        points = [np.load(file.with_name(file.name.replace("poses", "points"))) for file in files]
-        pixels, labels = (np.concatenate([part[name] for part in points]) for name in ("pixels", "labels"))
-        return sequence, _Labelled(torch.from_numpy(pixels), torch.from_numpy(labels).long())
-
-    def _draw(self, sequence: PoseSequence, labelled: _Labelled) -> None:
-        """The overlay video, from the recording's images and the poses."""
-        camera, body, size = self.model.camera, self.model.body, self.model.size
-        assert sequence.pose is not None
-        shown = [sequence.angle_names.index(name) for name in _SHOWN]
-        with open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate) as video:
-            for i in range(len(sequence)):
-                image = self._image(i)
-                overlay = Overlay(sequence.status[i])
-                if bool(sequence.pose[i].isfinite().all()):
-                    posed = body(sequence.pose[i : i + 1].to(size), size)
-                    angles = sequence.angles[i, shown].rad2deg().round().int().tolist()
-                    lines = (f"elbow L {angles[0]}  R {angles[1]}", f"knee  L {angles[2]}  R {angles[3]}")
-                    overlay = Overlay(
-                        sequence.status[i],
-                        camera.project(outline(posed))[0].cpu(),
-                        camera.project(posed.joints)[0].cpu(),
-                        labelled.pixels[i],
-                        labelled.labels[i],
-                        lines,
+    def _collect(self) -> list[tuple[PoseSequence, _Labelled, int]]:
+        """Poses and labelled points of the first person, and of others who have enough poses, with their numbers."""
+        found = []
+        for person in range(self._count()):
+            poses, points = [], []
+            for file in self._files():
+                first, own = read_poses_npz(file), self._folder(person) / file.name
+                poses.append(read_poses_npz(own) if own.exists() else first.of_nobody())
+                points.append(self._points(own, len(first)))
+            sequence = PoseSequence.join(poses)
+            if person == 0 or int(np.sum(sequence.answered)) >= FEWEST:
+                most = max(labels.shape[1] for _, labels in points)
+                pixels, labels = (
+                    np.concatenate(
+                        [
+                            np.pad(
+                                part,
+                                [(0, 0), (0, most - part.shape[1])] + [(0, 0)] * (part.ndim - 2),
+                                constant_values=nothing,
+                            )
+                            for part in parts
+                        ]
                     )
-                video.write(draw_overlay(image, overlay))
+                    for parts, nothing in zip(zip(*points, strict=True), (np.nan, -1), strict=True)
+                )
+                labelled = _Labelled(torch.from_numpy(pixels), torch.from_numpy(labels).long())
+                found.append((sequence, labelled, person))
+        return found
+
+    def _points(self, poses: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Labelled points of a part, none where a person has none."""
+        file = poses.with_name(poses.name.replace("poses", "points"))
+        if not file.exists():
+            return np.zeros((count, 0, 2), np.float32), np.zeros((count, 0), np.int8)
+        part = np.load(file)
+        return part["pixels"], part["labels"]
+
+    def _draw(self, found: list[tuple[PoseSequence, _Labelled, int]]) -> None:
+        """The overlay video, from the recording's images and the poses."""
+        camera = self.model.camera
+        with open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate) as video:
+            for i in range(len(found[0][0])):
+                image = self._image(i)
+                for sequence, labelled, person in found:
+                    if person == 0 or sequence.answered[i]:
+                        image = draw_overlay(image, self._overlay(sequence, labelled, person, i))
+                video.write(image)
+
+    def _overlay(self, sequence: PoseSequence, labelled: _Labelled, person: int, i: int) -> Overlay:
+        """What is drawn of a person in a frame; words of the first alone."""
+        camera, body, size = self.model.camera, self.model.body, self.people.followers[person].model.size
+        assert sequence.pose is not None
+        status = sequence.status[i] if person == 0 else ""
+        if not bool(sequence.pose[i].isfinite().all()):
+            return Overlay(status)
+        posed = body(sequence.pose[i : i + 1].to(size), size)
+        shown = [sequence.angle_names.index(name) for name in _SHOWN]
+        angles = sequence.angles[i, shown].rad2deg().round().int().tolist()
+        lines = (f"elbow L {angles[0]}  R {angles[1]}", f"knee  L {angles[2]}  R {angles[3]}")
+        return Overlay(
+            status,
+            camera.project(outline(posed))[0].cpu(),
+            camera.project(posed.joints)[0].cpu(),
+            labelled.pixels[i],
+            labelled.labels[i],
+            lines if person == 0 else (),
+        )
 
     def _image(self, position: int) -> Float[Tensor, "3 height width"]:
         """What a person sees of a frame: its left image, its depth as grey, or black where it cannot be read."""
@@ -269,6 +332,10 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
         f"time              {summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame",
         "CPU ms a frame    "
         + ", ".join(f"{name} {ms:.0f}" for name, ms in summary["cpu_ms_per_frame"].items()),
+        *(
+            f"person {number}          " + ", ".join(f"{count} {name}" for name, count in other.items())
+            for number, other in enumerate(summary["others"], 2)
+        ),
         f"results           {output}/ poses.csv, poses.npz, person.yaml, overlay.mp4, angles.png, summary.json",
     ]
     problems = summary["problems"]

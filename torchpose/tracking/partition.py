@@ -63,7 +63,7 @@ def split_people(
     pixel = torch.stack([columns, rows], -1).to(z) * step
     points = camera.back_project(pixel, z[rows, columns])
     pieces = connected_pieces((known & ~_edges(z, config.jump))[None], connectivity=4)
-    piece = _spread(pieces.labels[0], known)[rows, columns]
+    piece = _spread(pieces.labels[0].long(), known)[rows, columns]
     owner = torch.zeros_like(piece)  # 0 is nobody
     near = torch.zeros_like(piece, dtype=torch.bool)
     if expected is not None:

@@ -4,7 +4,7 @@ On an image the window is of whole pixels and moves as OpenCV's `meanShift` and 
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from enum import Enum
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,12 +15,19 @@ MARGIN = 10  # px around the window found, in which CamShift looks for the objec
 AROUND = 2  # px, by which its next window is wider than the object
 
 
+class Kernel(Enum):
+    """How a point's weight falls with its distance."""
+
+    gaussian = "gaussian"
+    flat = "flat"
+
+
 @dataclass(frozen=True)
 class MeanShiftConfig:
     """Settings of `mean_shift`."""
 
     bandwidth: float = 0.2  # m, standard deviation of the Gaussian kernel, radius of the flat one
-    kernel: Literal["gaussian", "flat"] = "gaussian"
+    kernel: Kernel = Kernel.gaussian
     steps: int = 50  # at the most
     tolerance: float = 1e-4  # m; a shorter step is the last
 
@@ -28,8 +35,6 @@ class MeanShiftConfig:
         for name in ("bandwidth", "tolerance"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)} m")
-        if self.kernel not in ("gaussian", "flat"):
-            raise ValueError(f"kernel must be 'gaussian' or 'flat', got {self.kernel!r}")
         if self.steps < 1:
             raise ValueError(f"steps must be at least 1, got {self.steps}")
 
@@ -80,7 +85,7 @@ def mean_shift(
     total = torch.zeros_like(start[..., 0])
     for step in range(config.steps + 1):
         square = (position[:, :, None] - points[:, None]).square().sum(-1) / config.bandwidth**2
-        share = (-0.5 * square).exp() if config.kernel == "gaussian" else (square <= 1).to(points)
+        share = (-0.5 * square).exp() if config.kernel is Kernel.gaussian else (square <= 1).to(points)
         share = share * weights[:, None]
         total = share.sum(-1)
         if step == config.steps or not bool(moving.any()):
