@@ -14,12 +14,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body.model import PosedBody
+from torchpose.export import JOINT_NAMES
 from torchpose.eyes import Sight, View
 from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
 from torchpose.recording import Frame, Recording, UnreadableFrame
 from torchpose.registration.vem import Observation, Registration
 from torchpose.tracking.kalman import Gaussian
-from torchpose.tracking.location import Location, LocationConfig, LocationFilter, nowhere, sighting
+from torchpose.tracking.location import (
+    Location,
+    LocationConfig,
+    LocationFilter,
+    Sighting,
+    nowhere,
+    sighting,
+)
 from torchpose.tracking.partition import PartitionConfig, split_people
 from torchpose.tracking.tracker import Person, TrackStatus, track_together
 from torchpose.vision.clump import ArtefactConfig, keep_points, person_points
@@ -44,16 +52,24 @@ class PeopleConfig:
     before: float = 0.3  # m by which the scene must be nearer than a person, to hide what lies behind it
     hidden_parts: int = 2  # of the body, that make a person partly visible
     memory: float = 2.0  # s for which the location of somebody unseen is believed
+    pose_sd: float = 0.03  # m, of head and trunk as a pose has them
     same_clothes: float = 0.75  # similarity of colours, from which somebody who comes back is the same
+    apart: float = 0.4  # m, least distance of two people's trunks seen from above
+    middle_sd: float = 0.15  # m by which the middle of a silhouette is off the trunk's
+    strangeness: float = (
+        2.0  # up to which a newcomer is somebody known: 1 for clothes at the limit above, 1 for a
+    )
+    # place two standard deviations off
+    scraps: float = 0.2  # of a newcomer's pixels; who has fewer may be the newcomer
     arrival: int = 3  # frames in which somebody further must be seen, before a pose is sought
     size_apart: float = 0.4  # s between the frames from which the size is measured on the way
 
     def __post_init__(self) -> None:
-        for name in ("before", "memory", "size_apart"):
+        for name in ("before", "memory", "pose_sd", "size_apart", "apart", "middle_sd", "strangeness"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if not 0 <= self.same_clothes <= 1:
-            raise ValueError(f"same_clothes must be a similarity in [0, 1], got {self.same_clothes}")
+        if not 0 <= self.same_clothes < 1:
+            raise ValueError(f"same_clothes must be a similarity in [0, 1), got {self.same_clothes}")
         if min(self.hidden_parts, self.arrival) < 1:
             raise ValueError(
                 f"hidden_parts and arrival must be at least 1, got {self.hidden_parts} and {self.arrival}"
@@ -162,7 +178,7 @@ class People:
         ]
         with self.model.stopwatch.measure("people"):
             sights = [
-                None if sight is None else self._locate(follower, sight, time_s)
+                None if sight is None else self._without_artefacts(follower, sight, time_s)
                 for follower, sight in zip(self.followers, sights, strict=True)
             ]
             covered = [
@@ -200,6 +216,9 @@ class People:
                 status = TrackStatus.entering
             elif status is TrackStatus.absent and self._behind(expected[k], covered[k]):
                 status = TrackStatus.lost
+            if sight is not None:
+                with self.model.stopwatch.measure("people"):
+                    self._relocate(follower, sight, tracked.registration, time_s)
             if sight is not None and tracked.registration is not None:
                 with self.model.stopwatch.measure("registration"):
                     follower.model.learn_colours(sight, tracked.registration)
@@ -239,8 +258,9 @@ class People:
         for k, mask in zip(there, masks, strict=False):
             own[k] = mask
         for mask in masks[len(there) :]:
-            free = [k for k in range(len(own)) if not bool(own[k].any())]
-            who = self._who_is(view, mask, free)
+            # Whoever has only scraps may be this one: a newcomer is as large as somebody.
+            few = self.config.scraps * int(mask.sum())
+            who = self._who_is(view, mask, [k for k in range(len(own)) if int(own[k].sum()) < few], time_s)
             if who is None:
                 if len(self.followers) >= self.model.eyes.config.people:
                     continue
@@ -248,25 +268,40 @@ class People:
                 own.append(nobody)
                 who = len(own) - 1
                 self._guess_height(self.followers[who], view, mask)
-            own[who] = mask
+            own[who] = own[who] | mask
         return own
 
-    def _who_is(self, view: View, mask: Bool[Tensor, "height width"], free: list[int]) -> int | None:
-        """Which of the free followers a newcomer is; None if it is somebody new.
+    def _who_is(
+        self, view: View, mask: Bool[Tensor, "height width"], free: list[int], time_s: float
+    ) -> int | None:
+        """Which of the free followers a newcomer is, by clothes and by where each should be; None if somebody new.
 
         A first person who was never there is whoever comes first.
         """
         unknown = [k for k in free if not self.followers[k].known and self.followers[k].seen == 0]
         if unknown:
             return unknown[0]
-        if not view.coloured:
-            return free[0] if len(free) == 1 else None
-        clothes = colour_histogram(view.images, mask[None])
-        best, similar = None, self.config.same_clothes
-        for k in free:
-            worn = self.followers[k].clothes
-            if worn is not None and float(colour_similarity(worn, clothes)[0]) >= similar:
-                best, similar = k, float(colour_similarity(worn, clothes)[0])
+        clothes = colour_histogram(view.images, mask[None]) if view.coloured else None
+        v, u = (mask & (view.depth[0] > 0)).nonzero(as_tuple=True)
+        points = self.model.camera.back_project(torch.stack([u, v], -1).to(view.depth), view.depth[0, v, u])
+        middle = points.median(0).values
+        best, least = None, self.config.strangeness
+        for k, follower in enumerate(self.followers):
+            strange = 0.0
+            if clothes is not None and follower.clothes is not None:
+                alike = float(colour_similarity(follower.clothes, clothes)[0])
+                strange += (1 - alike) / (1 - self.config.same_clothes)
+            if self._located(follower, time_s):
+                body = self.filter.predict(follower.location, time_s).body
+                off = (middle - body.mean[0])[[0, 2]] ** 2  # upright or stooping: not the height
+                if float(off.sum().sqrt()) < self.config.apart:
+                    return k  # two people are not at one place: this is more of the same
+                variance = body.covariance[0].diagonal()[[0, 2]] + self.config.middle_sd**2
+                strange += float((off / variance).sum()) / 4
+            elif k not in free or clothes is None or follower.clothes is None:
+                continue
+            if strange < least:
+                best, least = k, strange
         return best
 
     def _guess_height(self, follower: Follower, view: View, mask: Bool[Tensor, "height width"]) -> None:
@@ -278,8 +313,11 @@ class People:
         recent = 0 < time_s - follower.face_time < self.model.eyes.config.memory
         return follower.face if recent else None
 
-    def _locate(self, follower: Follower, sight: Sight, time_s: float) -> Sight:
-        """Head and trunk go into the filter, and points that are not the person's go out of the sight."""
+    def _without_artefacts(self, follower: Follower, sight: Sight, time_s: float) -> Sight:
+        """The sight without points that cannot be the person's, by where he or she should be.
+
+        Whoever has no pose to expect is located first, by head and trunk.
+        """
         follower.face = sight.faces.memory
         if follower.face is not None:
             follower.face_time = time_s
@@ -287,6 +325,18 @@ class People:
             return sight
         if not self._located(follower, time_s):
             follower.location = nowhere(follower.location.mean[:, :3])
+        if follower.model.tracker.expect(time_s) is None:
+            follower.location = self.filter.step(
+                follower.location, self._measure(follower, sight, time_s), time_s
+            ).location
+        at = self.filter.predict(follower.location, time_s)
+        sds = _spread(at.head), _spread(at.body)
+        kept = person_points(sight.cloud, at.head.mean, at.body.mean, *sds, self.config.artefact)
+        cloud = keep_points(sight.cloud, kept)
+        return replace(sight, cloud=cloud, present=int(cloud.mask.sum()) >= self.model.eyes.config.min_points)
+
+    def _measure(self, follower: Follower, sight: Sight, time_s: float) -> Sighting:
+        """Head and trunk by face, shape and mean shift, near where they should be."""
         at = self.filter.predict(follower.location, time_s)
         cloud = sight.cloud
         weights = cloud.mask.to(cloud.points)
@@ -310,13 +360,28 @@ class People:
                 _spread(at.head),
             )
             head, head_sd = heads.position, heads.sd
-        seen = sighting(head=head, body=trunk.position, head_sd=head_sd, body_sd=trunk.sd)
-        follower.location = self.filter.step(follower.location, seen, time_s).location
-        place = follower.location
-        sds = _spread(place.head), _spread(place.body)
-        kept = person_points(cloud, place.head.mean, place.body.mean, *sds, self.config.artefact)
-        cloud = keep_points(cloud, kept)
-        return replace(sight, cloud=cloud, present=int(cloud.mask.sum()) >= self.model.eyes.config.min_points)
+        return sighting(head=head, body=trunk.position, head_sd=head_sd, body_sd=trunk.sd)
+
+    def _relocate(self, follower: Follower, sight: Sight, found: Registration | None, time_s: float) -> None:
+        """What a frame's pose says of the place goes into the filter; without a pose, what head and trunk say.
+
+        A pose knows better than the densest place of the cloud, which in profile slides to the thighs.
+        """
+        measured = bool(follower.location.known[0]) and float(follower.location.time_s[0]) == time_s
+        if found is None:
+            if sight.present and not measured:
+                seen = self._measure(follower, sight, time_s)
+                follower.location = self.filter.step(follower.location, seen, time_s).location
+            return
+        joints = follower.model.body(found.pose, follower.model.size).joints
+        pelvis, head = joints[:, JOINT_NAMES.index("pelvis")], joints[:, JOINT_NAMES.index("head")]
+        body = head + (pelvis - head) / (1 + self.config.location.pelvis_share)
+        sd = torch.full_like(body[:, 0], self.config.pose_sd)
+        seen = sighting(head, body, sd, sd, (head - body).norm(dim=-1))
+        step = (
+            self.filter.begin(seen, time_s) if measured else self.filter.step(follower.location, seen, time_s)
+        )
+        follower.location = step.location
 
     def _covered(
         self, follower: Follower, view: View, masks: list[Tensor], own: int, time_s: float

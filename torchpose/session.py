@@ -91,6 +91,9 @@ class Session:
             self._follow(done, count)
         found = self._collect()
         with self.model.stopwatch.measure("export"):
+            for pattern in ("poses_*.csv", "poses_*.npz", "angles_*.png", "person_*.yaml"):
+                for old in self.output.glob(pattern):  # an earlier run may have found more people
+                    old.unlink()
             for number, (sequence, _, person) in enumerate(found, 1):
                 mark = "" if number == 1 else f"_{number}"
                 write_poses_csv(self.output / f"poses{mark}.csv", sequence)
