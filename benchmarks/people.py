@@ -30,11 +30,11 @@ from torch import Tensor
 from torchpose.body.angle import anatomical_angles, limb_angles
 from torchpose.body.model import BodyModel
 from torchpose.cli import InferConfig, load_config
-from torchpose.eyes import Eyes, Sight
-from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
+from torchpose.eyes import Eyes, View
+from torchpose.people import People, PeopleWindows
+from torchpose.pipeline import FramePose, StereoToPose
 from torchpose.recording import Backgrounds, Frame, Recording, open_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
-from torchpose.vision.points import sample_grid
 
 ORACLES = ("disparity", "mask", "labels", "start", "size")
 KINDS = ("elbow", "knee", "shoulder", "hip")
@@ -126,15 +126,16 @@ class RememberingEyes(Eyes):
 
     def __init__(self, eyes: Eyes):
         super().__init__(eyes.camera, eyes.config)
-        self.eyes, self.seen, self.stopwatch = eyes, dict[int, Sight](), eyes.stopwatch
+        self.eyes, self.seen, self.stopwatch = eyes, dict[int, View](), eyes.stopwatch
 
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
         if self.eyes.background is None:
             self.eyes.learn_background(backgrounds, recording, device)
+        self.background_depth = self.eyes.background_depth
 
-    def forward(self, frame: Frame, device: torch.device) -> Sight:
+    def look(self, frame: Frame, device: torch.device, most: int | None = None) -> View:
         if frame.index not in self.seen:
-            self.seen[frame.index] = self.eyes(frame, device)
+            self.seen[frame.index] = self.eyes.look(frame, device, most)
         return self.seen[frame.index]
 
 
@@ -145,24 +146,12 @@ class OracleEyes(Eyes):
         super().__init__(eyes.camera, eyes.config)
         self.truth, self.oracles, self.stopwatch = truth, oracles, eyes.stopwatch
 
-    def forward(self, frame: Frame, device: torch.device) -> Sight:
-        sight = super().forward(frame, device)
+    def look(self, frame: Frame, device: torch.device, most: int | None = None) -> View:
+        view = super().look(frame, device, most)
         true_mask = torch.from_numpy(self.truth.labels(frame.index) > 0)[None]
-        depth = self.truth.depth(frame.index) if "disparity" in self.oracles else sight.depth
-        mask = true_mask if "mask" in self.oracles else sight.silhouette
-        cloud = sample_grid(
-            depth,
-            mask & true_mask if "disparity" in self.oracles else mask,
-            self.camera,
-            self.config.sampling,
-        )
-        return replace(
-            sight,
-            depth=depth,
-            silhouette=mask,
-            cloud=cloud,
-            present=bool(cloud.mask.sum() >= self.config.min_points),
-        )
+        if "disparity" in self.oracles:
+            view = replace(view, depth=self.truth.depth(frame.index).where(true_mask, torch.nan))
+        return replace(view, silhouette=true_mask) if "mask" in self.oracles else view
 
 
 class TrueLabels(PartLikelihood):
@@ -248,22 +237,23 @@ def measure(
         model.eyes = OracleEyes(model.eyes, truth, oracles)
     if "labels" in oracles:
         model.likelihoods.append(labels)
+    people = People(model, config.people)
     begin = time.process_time()
-    model.prepare(recording)
+    people.prepare(recording)
     prepared = time.process_time() - begin
     model.stopwatch.seconds.clear()
     if "size" in oracles:
         model.size = true_size(model.body, truth)
     results: list[FramePose] = []
-    window = SmoothingWindow(model)
+    windows = PeopleWindows(people)
     begin = time.process_time()
     for position in range(min(len(recording), frames or len(recording))):
         frame = recording[position]
         labels.index = frame.index
         if "start" in oracles and position == 0:
             model.tracker.begin(true_pose(model.body, truth, frame.index), frame.time_s)
-        results += window.push(model.follow(frame))
-    results += window.flush()
+        results += [everybody[0] for everybody in windows.push(people.follow(frame))]
+    results += [everybody[0] for everybody in windows.flush()]
     total = time.process_time() - begin
     sequence = model.sequence(results)
     index = sequence.frame
@@ -289,6 +279,7 @@ def measure(
         "unanswered": float((~answered).float().mean()),
         "point_to_model_mm": float(1000 * sequence.point_to_model.nanmean()),
         "prepare_ms": 1000 * prepared,
+        "others": float(len(people.followers) - 1),
     }
     count = len(results)
     figures |= {f"{stage}_ms": 1000 * seconds / count for stage, seconds in model.stopwatch.seconds.items()}
