@@ -74,15 +74,13 @@ def split_people(
     foreign = _newcomers(points, pixel, near, piece, pieces, camera, config)
     for i, number in enumerate(foreign, people + 1):
         owner = torch.where(piece == number, i, owner)
-    labels = torch.zeros_like(mask, dtype=torch.long)
-    labels[rows, columns] = owner
-    # What stays without an owner near by, because its depth is unknown, follows the nearest pixel.
-    full = _spread(labels, mask).repeat_interleave(step, 0).repeat_interleave(step, 1)
-    full = full[: silhouette.shape[0], : silhouette.shape[1]]
+    decided = torch.zeros_like(mask, dtype=torch.long)  # 1 is nobody
+    decided[rows, columns] = owner + 1
+    # What was not judged, for want of depth or between two judged pixels, follows the nearest one.
+    full = _spread(decided, torch.ones_like(mask)).repeat_interleave(step, 0).repeat_interleave(step, 1)
+    full = full[: silhouette.shape[0], : silhouette.shape[1]] - 1
     numbers = torch.arange(1, people + len(foreign) + 1, device=full.device)
-    masks = full == numbers[:, None, None]
-    # A pixel between two judged ones belongs to the silhouette at full resolution or not.
-    return masks & silhouette
+    return (full == numbers[:, None, None]) & silhouette
 
 
 def _edges(depth: Float[Tensor, "rows columns"], jump: float) -> Bool[Tensor, "rows columns"]:
