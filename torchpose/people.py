@@ -50,7 +50,9 @@ class PeopleConfig:
     trunk: TrunkConfig = field(default_factory=TrunkConfig)
     artefact: ArtefactConfig = field(default_factory=ArtefactConfig)
     before: float = 0.3  # m by which the scene must be nearer than a person, to hide what lies behind it
-    hidden_parts: int = 2  # of the body, that make a person partly visible
+    hidden_parts: int = (
+        3  # of the body, that make a person partly visible; both feet are soon behind something
+    )
     memory: float = 2.0  # s for which the location of somebody unseen is believed
     pose_sd: float = 0.03  # m, of head and trunk as a pose has them
     same_clothes: float = 0.75  # similarity of colours, from which somebody who comes back is the same
