@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.model import BodyModel
+from torchpose.body.model import BodyModel, PosedBody
 from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
+from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
 from torchpose.registration.size import stack_observations
 from torchpose.registration.start import thin
 from torchpose.registration.vem import Observation, Registrar, Registration
@@ -36,6 +37,7 @@ class HypothesisConfig:
     sigma: float = 0.05  # m, in the first of them
     reach: tuple[int, ...] = (1, 3, 9)  # frames, to either side, from which places are tried
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
 
     def __post_init__(self) -> None:
         if self.sweeps < 0:
@@ -178,9 +180,14 @@ class _Work:
         for t, p in zip(frame.split(MOST), pose.split(MOST), strict=True):
             nothing = PosePrior(p, torch.zeros_like(p))
             bound = p.new_zeros(1, len(p))
-            found = registrar.evaluate(self.observation.take(t), p, self.size[t], nothing, bound, bound[0].long())
+            found = registrar.evaluate(self.seen(t, p), p, self.size[t], nothing, bound, bound[0].long())
             out.append(self._score(found))
         return torch.cat(out) if out else pose.new_zeros(0)
+
+    def seen(self, frame: Tensor, pose: Tensor) -> Observation:
+        """Frames, whose points are not of parts that are hidden at these poses."""
+        posed = self.of.body(pose, self.size[frame])
+        return unoccluded(self.observation.take(frame), posed, self.of.config.occlusion)
 
     def _score(self, found: Registration) -> Tensor:
         K = self.of.body.num_parts
@@ -238,7 +245,7 @@ class _Work:
         for t, l, p in zip(frame.split(MOST), limb.split(MOST), start.split(MOST), strict=True):
             hold = torch.full_like(p, HELD).scatter(1, self.of.search.limbs[l], 0.0)
             found = self.of.registrar(
-                self.observation.take(t), p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
+                self.seen(t, p), p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
             )
             out.append(torch.where(found.pose.isfinite().all(1, keepdim=True), found.pose, p))
         return torch.cat(out)
@@ -293,3 +300,11 @@ def _sound(cost: Tensor) -> Tensor:
     """A frame without a finite cost for its first hypothesis says nothing."""
     broken = ~cost[..., :1].isfinite()
     return torch.where(broken, 0.0, torch.where(cost.isfinite(), cost, torch.inf))
+
+
+def unoccluded(observation: Observation, posed: PosedBody, config: OcclusionConfig) -> Observation:
+    """The observation with what the posed body hides of itself among its potentials."""
+    if config.penalty == 0:
+        return observation
+    hidden = occlusion_potential(posed, observation.cloud.points, config)
+    return replace(observation, potential=observation.potential + hidden)

@@ -16,7 +16,7 @@ from torchpose.body.model import BodyModel
 from torchpose.least_squares import NormalEquations, Status
 from torchpose.registration.fitting import PosePrior, equations_by_moments
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
-from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses
+from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses, unoccluded
 
 ANGLES = slice(3, 6)  # of the root, which come round again
 MOST = 48  # rows registered at once: more are no faster
@@ -222,6 +222,7 @@ class Smoother(nn.Module):
         registrar = self.registrar
         posed = self.body(pose, size)
         foot = registrar.correspond(posed, observation)
+        observation = unoccluded(observation, posed, self.config.hypotheses.occlusion)
         labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
         rows, support = registrar.rows(posed, foot, labelling, observation)
         rest = registrar.with_rest(PosePrior(pose, torch.zeros_like(pose)), support)
