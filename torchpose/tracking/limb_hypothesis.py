@@ -8,7 +8,7 @@ legs are nearly independent given the trunk, so each limb has a chain of its own
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel, PosedBody
@@ -22,6 +22,7 @@ from torchpose.registration.vem import Observation, Registrar, Registration
 from torchpose.tracking.trellis import best_sequence, spread, step_cost, weights
 
 MOST = 64  # rows registered at once: more are no faster
+Candidates = Float[Tensor, "frames limbs candidates 4"]
 HELD = 1e6  # precision, rad and m, of the rest of the body while a limb is fitted
 
 
@@ -33,6 +34,7 @@ class HypothesisConfig:
     keep: int = 8  # places of each limb in each frame
     apart: float = 0.25  # rad by which two of them differ
     fits: int = 2  # new ones of each limb and frame that are fitted in each sweep
+    hopeless: float = 30.0  # nats by which a place may be worse than where the limb is believed to be
     rounds: int = 3  # of these fits
     sigma: float = 0.05  # m, in the first of them
     reach: tuple[int, ...] = (1, 3, 9)  # frames, to either side, from which places are tried
@@ -56,17 +58,26 @@ class Table:
     place: Float[Tensor, "frames limbs hypotheses 4"]  # rad
     cost: Float[Tensor, "frames limbs hypotheses"]  # nats, of the frame alone
 
-    def best(self, keep: int) -> "Table":
-        """The cheapest ones; the first, where the limb is believed to be, always stays."""
-        if self.cost.shape[2] <= keep:
-            return self
-        rank = self.cost.clone()
+    def best(self, keep: int, apart: float, hopeless: float) -> "Table":
+        """The cheapest ones that differ from each other; the first, where the limb is believed to be, always stays."""
+        rank = torch.where(self.cost > self.cost[..., :1] + hopeless, torch.inf, self.cost)
         rank[..., 0] = -torch.inf
-        index = rank.topk(keep, 2, largest=False).indices
-        return Table(
-            self.place.gather(2, index[..., None].expand(-1, -1, -1, self.place.shape[3])),
-            self.cost.gather(2, index),
-        )
+        index, costs = [], []
+        for _ in range(min(keep, rank.shape[2])):
+            least, which = rank.min(2)
+            index.append(which)
+            costs.append(torch.where(least < torch.inf, self.cost.gather(2, which[..., None])[..., 0], torch.inf))
+            rank = torch.where(self._near(which, apart), torch.inf, rank)
+        place = self.place.gather(2, torch.stack(index, 2)[..., None].expand(-1, -1, -1, self.place.shape[3]))
+        cost = torch.stack(costs, 2)
+        # An empty place is a number, too, or it would spoil sums in which it does not count.
+        return Table(torch.where(cost[..., None].isinf(), place[:, :, :1], place), cost)
+
+    def _near(self, which: Int[Tensor, "frames limbs"], apart: float) -> Tensor:
+        """Those that hardly differ from one."""
+        one = self.place.gather(2, which[..., None, None].expand(-1, -1, 1, self.place.shape[3]))
+        near = (self.place - one).abs().amax(3) < apart
+        return near.scatter(2, which[..., None], True)
 
     def first(self, chosen: Int[Tensor, "frames limbs"]) -> "Table":
         """With the chosen ones in front."""
@@ -81,12 +92,19 @@ class Table:
 class LimbHypotheses(nn.Module):
     """Chooses among several places of each limb over a stretch of frames."""
 
+    beside: Tensor  # (limbs,) the limb of the other side
+
     def __init__(self, body: BodyModel, registrar: Registrar, config: HypothesisConfig = HypothesisConfig()):
         super().__init__()
         self.body, self.config = body, config
         alone = LabellingConfig(sweeps=0, potts=0.0)
         self.registrar = Registrar(body, replace(registrar.config, labelling=alone))
         self.search = LimbSearch(body, self.registrar, config.limbs)
+        names = [body.parameter_names[limb[0]] for limb in self.search.limbs.tolist()]
+        # Arms compete for the same points, and so do legs: each limb and that of the other side.
+        kinds = [_unsided(name) for name in names]
+        beside = [next((n for n, b in enumerate(kinds) if n != k and a == b), -1) for k, a in enumerate(kinds)]
+        self.register_buffer("beside", torch.tensor(beside), persistent=False)
 
     def forward(
         self,
@@ -110,24 +128,20 @@ class LimbHypotheses(nn.Module):
             [thin(observation.take(torch.tensor([t], device=pose.device)), self.config.points) for t in range(T)]
         )
         size = size.expand(T, -1)
-        work = _Work(self, few, size, rest_share)
-        limbs = self.search.limbs
-        table = work.start(pose)
-        table = work.add(table, pose, *work.searched(pose), self.config.fits + 1)
-        pulls = pull[:, limbs]
-        for sweep in range(self.config.sweeps):
-            table = work.add(table, pose, *self._elsewhere(table), self.config.fits)
+        work, limbs = _Work(self, few, size, rest_share), self.search.limbs
+        table, pulls = work.start(pose), pull[:, limbs]
+        table = work.add(table, pose, work.searched(pose))
+        for _ in range(self.config.sweeps):
+            table = work.add(table, pose, self._elsewhere(table))
             for limb in range(L):
-                step = step_cost(table.place[:, limb : limb + 1], pulls[:, limb : limb + 1])
+                own = slice(limb, limb + 1)
                 chosen = torch.zeros(T, L, dtype=torch.long, device=pose.device)
-                chosen[:, limb] = best_sequence(_sound(table.cost[:, limb : limb + 1]), step)[:, 0]
-                moved = chosen[:, limb] > 0
+                step = step_cost(table.place[:, own], pulls[:, own])
+                chosen[:, own] = best_sequence(_sound(table.cost[:, own]), step)
                 table = table.first(chosen)
-                pose = pose.index_put(
-                    (torch.arange(T, device=pose.device)[:, None], limbs[limb]), table.place[:, limb, 0]
-                )
-                if bool(moved.any()):
-                    table = work.again(table, pose, moved)
+                pose = pose.scatter(1, limbs[own].expand(T, -1), table.place[:, limb, 0])
+                beside = (chosen[:, own] > 0) & (self.beside == limb)
+                table = work.again(table, pose, beside)
         weight = weights(_sound(table.cost), step_cost(table.place, pulls))
         more = spread(table.place, weight, table.place[:, :, 0])
         covariance = pose.new_zeros(T, P, P)
@@ -135,28 +149,20 @@ class LimbHypotheses(nn.Module):
             covariance[:, own[:, None], own] += more[:, limb]
         return pose, covariance
 
-    def _elsewhere(self, table: Table) -> tuple[Tensor, Tensor, Tensor]:
-        """Frames, limbs and places: where other frames have the limb, or might have it."""
-        T, L, H, _ = table.place.shape
-        # Of each frame the place where the limb is believed to be, and the best other one.
+    def _elsewhere(self, table: Table) -> Candidates:
+        """Where other frames have the limb: the place where it is believed to be there, and the best other one."""
+        T = len(table.place)
         rank = table.cost.clone()
         rank[..., 0] = torch.inf
-        rank[(table.place - table.place[:, :, :1]).abs().amax(3) < self.config.apart] = torch.inf
-        second = rank.argmin(2)
-        known = rank.amin(2).isfinite()
-        other = table.place.gather(2, second[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
-        frames = torch.arange(T, device=second.device)
-        out: list[tuple[Tensor, Tensor, Tensor]] = []
-        for way in (d * side for d in self.config.reach for side in (-1, 1)):
-            source = frames + way
-            inside = ((source >= 0) & (source < T))[:, None].expand(-1, L)
-            source = source.clamp(0, T - 1)
-            for place, there in ((table.place[:, :, 0], None), (other, known)):
-                ok = inside if there is None else inside & there[source]
-                t, limb = ok.nonzero(as_tuple=True)
-                out.append((t, limb, place[source][t, limb]))
-        t, limb, place = (torch.cat(x) for x in zip(*out, strict=True))
-        return t, limb, place
+        second = table.place.gather(2, rank.argmin(2)[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
+        second = torch.where(rank.amin(2)[..., None].isfinite(), second, torch.nan)
+        frames, out = torch.arange(T, device=second.device), []
+        for places in (second, table.place[:, :, 0]):
+            for way in (d * side for d in self.config.reach for side in (-1, 1)):
+                source = frames + way
+                inside = ((source >= 0) & (source < T))[:, None, None]
+                out.append(torch.where(inside, places[source.clamp(0, T - 1)], torch.nan))
+        return torch.stack(out, 2)
 
 
 @dataclass(frozen=True)
@@ -168,6 +174,10 @@ class _Work:
     size: Float[Tensor, "frames sizes"]
     rest_share: float
 
+    @property
+    def limbs(self) -> Int[Tensor, "limbs 4"]:
+        return self.of.search.limbs
+
     def start(self, pose: Float[Tensor, "frames parameters"]) -> Table:
         """The believed places alone."""
         T, L = len(pose), len(self.of.search.limbs)
@@ -177,7 +187,7 @@ class _Work:
     def nats(self, frame: Int[Tensor, " rows"], pose: Float[Tensor, "rows parameters"]) -> Float[Tensor, " rows"]:
         """Minus the log-density of frames at poses, with the pull to rest that counts in one frame of many."""
         registrar, out = self.of.registrar, []
-        for t, p in zip(frame.split(MOST), pose.split(MOST), strict=True):
+        for t, p in zip(frame.split(MOST), pose.split(MOST), strict=True) if len(frame) else ():
             nothing = PosePrior(p, torch.zeros_like(p))
             bound = p.new_zeros(1, len(p))
             found = registrar.evaluate(self.seen(t, p), p, self.size[t], nothing, bound, bound[0].long())
@@ -187,7 +197,7 @@ class _Work:
     def seen(self, frame: Tensor, pose: Tensor) -> Observation:
         """Frames, whose points are not of parts that are hidden at these poses."""
         posed = self.of.body(pose, self.size[frame])
-        return unoccluded(self.observation.take(frame), posed, self.of.config.occlusion)
+        return unoccluded(self.observation.share(frame), posed, self.of.config.occlusion)
 
     def _score(self, found: Registration) -> Tensor:
         K = self.of.body.num_parts
@@ -202,98 +212,80 @@ class _Work:
         terms, _ = pose_terms(self.of.body, found.pose, rest, replace(config, limit_sd=0.0))
         return found.score - (1 - self.rest_share) * 0.5 * terms.square().sum((1, 2))
 
-    def searched(self, pose: Float[Tensor, "frames parameters"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Frames, limbs and places that a search in some frames finds."""
-        limbs, best = self.of.search.limbs, self.of.config.limbs.best
-        frames = torch.arange(self.of.config.every // 2, len(pose), self.of.config.every, device=pose.device)
-        places = []
-        for t in frames.split(1):
-            found = self.of.search(self.observation.take(t), pose[t], self.size[t])  # (L, best, P)
-            places.append(found.gather(2, limbs[:, None].expand(-1, best, -1)))
-        L = len(limbs)
-        t = frames.repeat_interleave(L * best)
-        limb = torch.arange(L, device=pose.device).repeat_interleave(best).repeat(len(frames))
-        return t, limb, torch.stack(places).flatten(0, 2)
+    def searched(self, pose: Float[Tensor, "frames parameters"]) -> Candidates:
+        """Where a search in some frames finds points for a limb."""
+        T, L, best = len(pose), len(self.limbs), self.of.config.limbs.best
+        place = pose.new_full((T, L, best, 4), torch.nan)
+        for t in range(self.of.config.every // 2, T, self.of.config.every):
+            one = torch.tensor([t], device=pose.device)
+            found = self.of.search(self.observation.take(one), pose[one], self.size[one])  # (L, best, P)
+            place[t] = found.gather(2, self.limbs[:, None].expand(-1, best, -1))
+        return place
 
-    def add(
-        self, table: Table, pose: Tensor, frame: Tensor, limb: Tensor, place: Tensor, fits: int
-    ) -> Table:
-        """With new places: those that differ from what is there, as they are and, the best few, fitted."""
-        config, limbs = self.of.config, self.of.search.limbs
-        gap = (table.place[frame, limb] - place[:, None]).abs().amax(2)
-        gap = torch.where(table.cost[frame, limb].isinf(), torch.inf, gap)
-        new = gap.amin(1) > config.apart
-        frame, limb, place = frame[new], limb[new], place[new]
-        if not len(frame):
-            return table
-        own = limbs[limb]
-        start = pose[frame].scatter(1, own, place)
-        cost = self.nats(frame, start)
-        raw = self._packed(table, frame, limb, place, cost)
-        some = raw.best_of_new(table, fits, config.apart)
-        t, l, h = some.nonzero(as_tuple=True)
-        start = pose[t].scatter(1, limbs[l], raw.table.place[t, l, h])
-        fitted = self._fit(t, l, start)
-        fitted_place = fitted.gather(1, limbs[l])
-        # On the believed rest of the body, which the fit may have moved a little.
-        done = self.nats(t, pose[t].scatter(1, limbs[l], fitted_place))
-        kept = Table(raw.table.place, torch.where(raw.allowed(table, some), raw.table.cost, torch.inf))
-        return self._packed(kept, t, l, fitted_place, done).table.best(config.keep)
+    def add(self, table: Table, pose: Float[Tensor, "frames parameters"], place: Candidates) -> Table:
+        """With new places: the best few of those that differ from what is there, as they are and fitted."""
+        config = self.of.config
+        new = self._new(table, place)
+        raw = self._cost(pose, place, new)
+        few = Table(place, raw).best(config.fits, config.apart, torch.inf)
+        open_ = few.cost < table.cost[..., :1] + config.hopeless
+        frame, limb, slot = open_.nonzero(as_tuple=True)
+        fitted = few.place.clone()
+        start = pose[frame].scatter(1, self.limbs[limb], few.place[frame, limb, slot])
+        fitted[frame, limb, slot] = self._fit(frame, limb, start).gather(1, self.limbs[limb])
+        cost = self._cost(pose, fitted, open_)
+        together = Table(
+            torch.cat([table.place, few.place, fitted], 2),
+            torch.cat([table.cost, torch.where(open_, few.cost, torch.inf), cost], 2),
+        )
+        return together.best(config.keep, config.apart / 2, config.hopeless)
+
+    def _new(self, table: Table, place: Candidates) -> Bool[Tensor, "frames limbs candidates"]:
+        """Those that differ from the table's and from those before them."""
+        apart, known = self.of.config.apart, torch.where(table.cost[..., None].isfinite(), table.place, torch.nan)
+        known[:, :, 0] = table.place[:, :, 0]
+        new = []
+        for one in place.unbind(2):
+            near = ((known - one[:, :, None]).abs().amax(3) <= apart).any(2)
+            new.append(one.isfinite().all(2) & ~near)
+            known = torch.cat([known, torch.where(new[-1][..., None], one, torch.nan)[:, :, None]], 2)
+        return torch.stack(new, 2)
+
+    def _cost(
+        self,
+        pose: Float[Tensor, "frames parameters"],
+        place: Candidates,
+        some: Bool[Tensor, "frames limbs candidates"],
+    ) -> Float[Tensor, "frames limbs candidates"]:
+        """Of some places on the believed rest of the body; the others' are infinite."""
+        frame, limb, slot = some.nonzero(as_tuple=True)
+        posed = pose[frame].scatter(1, self.limbs[limb], place[frame, limb, slot])
+        cost = place.new_full(place.shape[:3], torch.inf)
+        cost[frame, limb, slot] = self.nats(frame, posed).nan_to_num(nan=torch.inf)
+        return cost
 
     def _fit(self, frame: Tensor, limb: Tensor, start: Tensor) -> Tensor:
         config, out = self.of.config, []
-        for t, l, p in zip(frame.split(MOST), limb.split(MOST), start.split(MOST), strict=True):
-            hold = torch.full_like(p, HELD).scatter(1, self.of.search.limbs[l], 0.0)
+        for t, k, p in (
+            zip(frame.split(MOST), limb.split(MOST), start.split(MOST), strict=True) if len(frame) else ()
+        ):
+            hold = torch.full_like(p, HELD).scatter(1, self.limbs[k], 0.0)
             found = self.of.registrar(
                 self.seen(t, p), p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
             )
             out.append(torch.where(found.pose.isfinite().all(1, keepdim=True), found.pose, p))
-        return torch.cat(out)
+        return torch.cat(out) if out else start
 
-    def _packed(self, table: Table, frame: Tensor, limb: Tensor, place: Tensor, cost: Tensor) -> "_Packed":
-        """The table with a list of places behind."""
-        T, L, H, _ = table.place.shape
-        chain = frame * L + limb
-        order = chain.argsort(stable=True)
-        count = torch.bincount(chain, minlength=T * L)
-        slot = torch.arange(len(chain), device=chain.device) - (count.cumsum(0) - count)[chain[order]]
-        more = int(count.max()) if len(chain) else 0
-        places = table.place[:, :, :1].repeat(1, 1, more, 1)
-        costs = table.cost.new_full((T, L, more), torch.inf)
-        places[frame[order], limb[order], slot] = place[order]
-        costs[frame[order], limb[order], slot] = cost[order]
-        return _Packed(Table(torch.cat([table.place, places], 2), torch.cat([table.cost, costs], 2)), H)
-
-    def again(self, table: Table, pose: Tensor, moved: Tensor) -> Table:
-        """With the costs of some frames anew, in which a limb was moved."""
-        frame, limb, h = (table.cost.isfinite() & moved[:, None, None]).nonzero(as_tuple=True)
-        placed = pose[frame].scatter(1, self.of.search.limbs[limb], table.place[frame, limb, h])
-        cost = table.cost.index_put((frame, limb, h), self.nats(frame, placed))
-        return Table(table.place, cost)
+    def again(
+        self, table: Table, pose: Float[Tensor, "frames parameters"], some: Bool[Tensor, "frames limbs"]
+    ) -> Table:
+        """With the costs of some limbs in some frames anew, since the limb beside it moved."""
+        cost = self._cost(pose, table.place, table.cost.isfinite() & some[..., None])
+        return Table(table.place, torch.where(some[..., None], cost, table.cost))
 
 
-@dataclass(frozen=True)
-class _Packed:
-    table: Table
-    old: int
-
-    def best_of_new(self, before: Table, num: int, apart: float) -> Tensor:
-        """The cheapest new ones that differ from each other."""
-        cost, some = self.table.cost.clone(), torch.zeros_like(self.table.cost, dtype=torch.bool)
-        cost[..., : self.old] = torch.inf
-        for _ in range(num):
-            best, index = cost.min(2)
-            chosen = self.table.place.gather(2, index[..., None, None].expand(-1, -1, 1, 4))
-            some |= torch.zeros_like(some).scatter(2, index[..., None], True) & best.isfinite()[..., None]
-            near = (self.table.place - chosen).abs().amax(3) < apart
-            cost = torch.where(near, torch.inf, cost)
-        return some
-
-    def allowed(self, before: Table, some: Tensor) -> Tensor:
-        """The old ones and the chosen new ones."""
-        keep = some.clone()
-        keep[..., : self.old] = True
-        return keep
+def _unsided(name: str) -> str:
+    return name.replace("left", "").replace("right", "")
 
 
 def _sound(cost: Tensor) -> Tensor:

@@ -196,7 +196,7 @@ class Smoother(nn.Module):
             for part in rows.split(MOST) if len(rows) else ():
                 twice = part.repeat(2)
                 old = self.registrar.evaluate(
-                    observation.take(part),
+                    observation.share(part),
                     pose[part],
                     sizes[part],
                     PosePrior(mean[part], precision[part]),
@@ -204,7 +204,7 @@ class Smoother(nn.Module):
                     now.status[part],
                 )
                 both = self.registrar(
-                    observation.take(twice),
+                    observation.share(twice),
                     torch.cat([pose[part], other[part]]),
                     sizes[twice],
                     PosePrior(mean[twice], precision[twice]),
