@@ -29,8 +29,9 @@ def depth_behind(posed: PosedBody, points: Float[Tensor, "batch num 3"]) -> Floa
     A part lies where the ray enters it, or where a ray that misses it comes nearest (in the stretched space in which
     it is the unit ball). Where the ray meets no other part it is minus infinity.
     """
-    depth = points[..., 2:]
-    ray = points / torch.where(depth == 0, 1.0, depth)  # of depth 1
+    # Padding lies in the camera, where no ray begins: any will do.
+    depth = torch.where(points[..., 2:] > 0, points[..., 2:], 1.0)
+    ray = torch.cat([points[..., :2] / depth, torch.ones_like(depth)], -1)
     camera = -(posed.centers[:, :, None] @ posed.frames) / posed.radii[:, :, None]  # (B, K, 1, 3)
     way = (ray[:, None] @ posed.frames) / posed.radii[:, :, None]
     # |camera + s way|^2 = 1

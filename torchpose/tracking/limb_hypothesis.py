@@ -228,7 +228,7 @@ class _Work:
         new = self._new(table, place)
         raw = self._cost(pose, place, new)
         few = Table(place, raw).best(config.fits, config.apart, torch.inf)
-        open_ = few.cost < table.cost[..., :1] + config.hopeless
+        open_ = few.cost < table.cost[..., :1] + 4 * config.hopeless
         frame, limb, slot = open_.nonzero(as_tuple=True)
         fitted = few.place.clone()
         start = pose[frame].scatter(1, self.limbs[limb], few.place[frame, limb, slot])
