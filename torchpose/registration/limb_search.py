@@ -17,6 +17,7 @@ from torchpose.registration.vem import Observation, Registrar
 
 # A limb is a body on the root that others hang from: its joint, and that of the body after it, have four parameters.
 PARAMETERS = 4
+CLOSE = 1e6  # nats by which a place falls behind that is beside a better one
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,14 @@ class LimbSearchConfig:
     candidates: int = 512  # poses of each limb that are scored roughly
     shortlist: int = 32  # of them that are scored exactly
     best: int = 3  # of these that are fitted
+    apart: float = 0.4  # rad by which these differ
     sigma: float = 0.06  # m, at which points count as a candidate's
 
     def __post_init__(self) -> None:
         if not 1 <= self.best <= self.shortlist <= self.candidates:
             raise ValueError(f"1 <= best <= shortlist <= candidates must hold, got {self}")
-        if not self.sigma > 0:
-            raise ValueError(f"sigma must be positive, in m, got {self.sigma}")
+        if not (self.sigma > 0 and self.apart >= 0):
+            raise ValueError(f"sigma must be positive, in m, and apart not negative, in rad, got {self}")
 
 
 class LimbSearch(nn.Module):
@@ -62,11 +64,21 @@ class LimbSearch(nn.Module):
         L, C = self.places.shape[:2]
         rest = self._rest_of_body(observation, pose, size)
         poses = pose.expand(L, C, -1).scatter(2, self.limbs[:, None].expand(-1, C, -1), self.places)
-        for keep, exact in ((self.config.shortlist, False), (self.config.best, True)):
-            score = self._score(observation, poses, size, rest, exact)
-            best = score.nan_to_num(nan=-torch.inf).topk(keep, 1).indices
-            poses = poses.gather(1, best[..., None].expand(-1, -1, poses.shape[2]))
-        return poses
+        score = self._score(observation, poses, size, rest, exact=False).nan_to_num(nan=-torch.inf)
+        short = score.topk(self.config.shortlist, 1).indices
+        poses = poses.gather(1, short[..., None].expand(-1, -1, poses.shape[2]))
+        score = self._score(observation, poses, size, rest, exact=True).nan_to_num(nan=-torch.inf)
+        # The best ones of all are often one place several times.
+        places = poses.gather(2, self.limbs[:, None].expand(-1, poses.shape[1], -1))
+        rank, best = score, []
+        for _ in range(self.config.best):
+            best.append(rank.argmax(1))
+            gap = (places - places.gather(1, best[-1][:, None, None].expand(-1, 1, PARAMETERS))).abs().amax(2)
+            # Those beside it come last, in case there are no others.
+            rank = torch.where(gap < self.config.apart, rank - CLOSE, rank)
+            rank = rank.scatter(1, best[-1][:, None], -torch.inf)
+        index = torch.stack(best, 1)
+        return poses.gather(1, index[..., None].expand(-1, -1, poses.shape[2]))
 
     def _score(
         self,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.body.ellipsoid import outline
@@ -60,13 +60,17 @@ def nearest_inside(mask: Bool[Tensor, "batch height width"]) -> Float[Tensor, "b
 
 
 def silhouette_rows(
-    posed: PosedBody, nearest: Float[Tensor, "#batch height width 2"], camera: StereoCamera, config: RimConfig
+    posed: PosedBody,
+    nearest: Float[Tensor, "masks height width 2"],
+    camera: StereoCamera,
+    config: RimConfig,
+    frame: Int[Tensor, " batch"] | None = None,
 ) -> Rows:
     """A row for each rim point of each part: where it projects beside the mask, the mask's edge draws it.
 
     `nearest` comes from `nearest_inside`. Points outside the image or within a pixel of the mask give empty
     rows, and the others are drawn to that pixel's distance, so that a row begins at zero: with a jump there, an
-    identical frame moved the joints by 8 mm every time.
+    identical frame moved the joints by 8 mm every time. `frame` is the mask of each body; None: its own, or the one.
     """
     B, K = posed.centers.shape[:2]
     points = outline(posed, config.rim_points)
@@ -80,8 +84,9 @@ def silhouette_rows(
     seen = ((pixel > 0) & (pixel < edge)).all(-1)
     # Rows that are not finite stay so, by `pixel`; their index must still be one.
     index = pixel.detach().nan_to_num().round().clamp(min=torch.zeros_like(edge), max=edge).long()
-    flat = (index[..., 1] * W + index[..., 0])[..., None].expand(-1, -1, 2)
-    goal = nearest.flatten(1, 2).expand(B, -1, -1).gather(1, flat).to(points)
+    if frame is None:
+        frame = torch.arange(B, device=index.device) if len(nearest) > 1 else index.new_zeros(B)
+    goal = nearest[frame[:, None], index[..., 1], index[..., 0]].to(points)
     # From whole pixel to whole pixel: what rounding leaves of the rest must not turn the way.
     unit = torch.nn.functional.normalize(index - goal, dim=-1)
     length = ((pixel - goal) * unit).sum(-1)

@@ -52,6 +52,7 @@ class StartConfig:
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
+    refresh_sigma: float = 0.05  # m, in a refresh's first round: all but a limb or two are right
     face_yaws: tuple[float, ...] = (-75.0, -35.0, 0.0, 35.0, 75.0)  # degrees, tried when a face is seen
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
@@ -101,13 +102,13 @@ class Starter(nn.Module):
         prior: PosePrior | None = None,
     ) -> Registration:
         """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
-        few = _thin(observation, self.config.points)
+        few = thin(observation, self.config.points)
         limbs = self.limb_search(few, pose, size)
         together = pose.clone()
         for own, best in zip(self.limb_search.limbs, limbs[:, 0], strict=True):
             together[:, own] = best[own]
         starts = torch.cat([pose, together, limbs.flatten(0, 1)])
-        return self._search(observation, starts, size, self.registrar.config.sigma_first, prior)
+        return self._search(observation, starts, size, self.config.refresh_sigma, prior)
 
     def _search(
         self,
@@ -119,7 +120,7 @@ class Starter(nn.Module):
     ) -> Registration:
         """Every start is fitted on a few points, the limbs of the good ones are exchanged in all pairs, and the best
         few combinations are fitted on all points. The registration with the least misfit is returned."""
-        few = _thin(observation, self.config.points)
+        few = thin(observation, self.config.points)
         rough = self.coarse(few, starts, size, _each(prior, len(starts)), self.config.rounds, sigma)
         misfit = self._score(rough)
         arms = self._exchange(rough.pose, misfit, ("upper_arm", "forearm"))
@@ -225,7 +226,7 @@ def _directions(
     return torch.nn.functional.normalize(rows, dim=-1)
 
 
-def _thin(observation: Observation, num: int) -> Observation:
+def thin(observation: Observation, num: int) -> Observation:
     """About `num` of the points, evenly along the grid; without neighbours, which thinning parts."""
     cloud = observation.cloud
     count = int(cloud.mask[0].sum())

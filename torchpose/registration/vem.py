@@ -84,6 +84,7 @@ class Observation:
     nearest: Float[Tensor, "#batch height width 2"]  # `nearest_inside` of the silhouette
     camera: StereoCamera
     geodesic: GeodesicTerm | None = None
+    frame: Int[Tensor, " batch"] | None = None  # whose row of `nearest` each row has; None: its own, or the one
 
     def expand(self, batch: int) -> "Observation":
         """The same observation for `batch` starts, without a copy."""
@@ -99,7 +100,9 @@ class Observation:
                 geodesic.longest,
                 geodesic.most,
             )
-        return Observation(cloud, _rows(self.potential, batch), self.nearest, self.camera, geodesic)
+        return Observation(
+            cloud, _rows(self.potential, batch), self.nearest, self.camera, geodesic, self.frame
+        )
 
     def take(self, index: Tensor) -> "Observation":
         """Some rows of the batch, each as often as `index` names it."""
@@ -109,6 +112,13 @@ class Observation:
         if geodesic is not None:
             geodesic = replace(geodesic, cell=geodesic.cell[index], distance=geodesic.distance[index])
         return Observation(cloud, self.potential[index], nearest, self.camera, geodesic)
+
+    def share(self, index: Tensor) -> "Observation":
+        """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames."""
+        few = replace(self, nearest=self.nearest[:1]).take(index)
+        return few if len(self.nearest) == 1 else replace(
+            few, nearest=self.nearest, frame=index if self.frame is None else self.frame[index]
+        )
 
 
 @dataclass(frozen=True)
@@ -269,7 +279,9 @@ class Registrar(nn.Module):
         """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
         rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud)
         if rim and self.config.rim.weight > 0:
-            across = silhouette_rows(posed, observation.nearest, observation.camera, self.config.rim)
+            across = silhouette_rows(
+                posed, observation.nearest, observation.camera, self.config.rim, observation.frame
+            )
             # Rims of one part move together, so they count as a few independent measurements, not as many.
             rows = Rows.cat(rows, across)
         return rows, support

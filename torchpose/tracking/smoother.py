@@ -6,7 +6,7 @@ which is the Rauch-Tung-Striebel smoother for these equations. Left-camera frame
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,6 +16,7 @@ from torchpose.body.model import BodyModel
 from torchpose.least_squares import NormalEquations, Status
 from torchpose.registration.fitting import PosePrior, equations_by_moments
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
+from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses, unoccluded
 
 ANGLES = slice(3, 6)  # of the root, which come round again
 MOST = 48  # rows registered at once: more are no faster
@@ -35,6 +36,7 @@ class SmoothingConfig:
     stretch: int = 50  # frames that are smoothed at once
     ahead: int = 12  # coming frames that they hear of
     rest_time: float = 2.0  # s after which an unseen limb forgets where it was
+    hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
 
     def __post_init__(self) -> None:
         if self.sweeps < 0 or self.rounds < 0 or self.steps < 1:
@@ -116,6 +118,7 @@ class Smoother(nn.Module):
     def __init__(self, body: BodyModel, registrar: Registrar, config: SmoothingConfig = SmoothingConfig()):
         super().__init__()
         self.body, self.registrar, self.config = body, registrar, config
+        self.hypotheses = LimbHypotheses(body, registrar, config.hypotheses)
 
     def forward(
         self,
@@ -148,13 +151,16 @@ class Smoother(nn.Module):
         for _ in range(self.config.sweeps):
             best = self._try_neighbours(observation, best, chain.pull, size)
         pose, covariance, filtered = best.pose, best.covariance, torch.zeros_like(best.covariance)
+        between = torch.zeros_like(covariance)
+        if self.config.rounds and self.config.hypotheses.sweeps:
+            pose, between = self.hypotheses(observation, pose, size, chain.pull, self._rest_share(time_s))
         for _ in range(self.config.rounds):
             equations = self._equations(observation, pose, size, time_s)
             pose, covariance, filtered = fit_chain(equations, pose, chain, self.config.steps)
         nothing = PosePrior(pose, torch.zeros_like(pose))
         status = torch.where(is_finite(tracked), best.status, int(Status.NON_FINITE))
         result = self.registrar.evaluate(observation, pose, size, nothing, best.bound, status)
-        return Smoothed(replace(result, covariance=covariance), time_s, filtered)
+        return Smoothed(replace(result, covariance=covariance + between), time_s, filtered)
 
     def _chain(self, time_s: Tensor, pose: Tensor, before: Message | None) -> Chain:
         """The poses' random walk."""
@@ -190,7 +196,7 @@ class Smoother(nn.Module):
             for part in rows.split(MOST) if len(rows) else ():
                 twice = part.repeat(2)
                 old = self.registrar.evaluate(
-                    observation.take(part),
+                    observation.share(part),
                     pose[part],
                     sizes[part],
                     PosePrior(mean[part], precision[part]),
@@ -198,7 +204,7 @@ class Smoother(nn.Module):
                     now.status[part],
                 )
                 both = self.registrar(
-                    observation.take(twice),
+                    observation.share(twice),
                     torch.cat([pose[part], other[part]]),
                     sizes[twice],
                     PosePrior(mean[twice], precision[twice]),
@@ -213,18 +219,21 @@ class Smoother(nn.Module):
         self, observation: Observation, pose: Tensor, size: Tensor, time_s: Tensor
     ) -> NormalEquations:
         """Of each frame alone, with the labels that its points have at this pose."""
-        registrar, config = self.registrar, self.config
+        registrar = self.registrar
         posed = self.body(pose, size)
         foot = registrar.correspond(posed, observation)
+        observation = unoccluded(observation, posed, self.config.hypotheses.occlusion)
         labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
         rows, support = registrar.rows(posed, foot, labelling, observation)
         rest = registrar.with_rest(PosePrior(pose, torch.zeros_like(pose)), support)
-        # Frame after frame an unseen limb would be drawn to rest anew: one pull in `rest_time` is meant.
-        share = 1.0
-        if len(time_s) > 1:
-            share = float(time_s.diff().mean().clamp(1e-3, config.rest_time)) / config.rest_time
-        rest = PosePrior(rest.mean, rest.precision * share)
+        rest = PosePrior(rest.mean, rest.precision * self._rest_share(time_s))
         return equations_by_moments(self.body, size, rows, rest, registrar.config.fitting, posed)
+
+    def _rest_share(self, time_s: Tensor) -> float:
+        """Frame after frame an unseen limb would be drawn to rest anew: one pull in `rest_time` is meant."""
+        if len(time_s) < 2:
+            return 1.0
+        return float(time_s.diff().mean().clamp(1e-3, self.config.rest_time)) / self.config.rest_time
 
 
 def fit_chain(
