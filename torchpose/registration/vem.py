@@ -57,7 +57,8 @@ class RegistrationConfig:
     noise_sd: float = 0.02  # m, of a point in the M-step
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
     rest_sd: float = 0.5  # rad, of the pull to the rest pose on joints of which nothing is seen; 0 is none
-    rest_support: float = 5.0  # points on a limb that halve this pull
+    rest_support: float = 5.0  # points on a limb that halve this pull, if they are
+    rest_lever: float = 0.25  # m or more from its joint; nearer ones count less
     compile: bool = False  # by torch.compile: 2 to 3 times as fast at batch 1, after minutes of compiling
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
@@ -67,7 +68,14 @@ class RegistrationConfig:
         for name in ("rounds", "near"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("sigma_first", "sigma_last", "noise_sd", "effective_points", "rest_support"):
+        for name in (
+            "sigma_first",
+            "sigma_last",
+            "noise_sd",
+            "effective_points",
+            "rest_support",
+            "rest_lever",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("outlier", "robust_sd", "rest_sd", "tangential"):
@@ -84,7 +92,9 @@ class Observation:
     nearest: Float[Tensor, "#batch height width 2"]  # `nearest_inside` of the silhouette
     camera: StereoCamera
     geodesic: GeodesicTerm | None = None
-    frame: Int[Tensor, " batch"] | None = None  # whose row of `nearest` each row has; None: its own, or the one
+    frame: Int[Tensor, " batch"] | None = (
+        None  # whose row of `nearest` each row has; None: its own, or the one
+    )
 
     def expand(self, batch: int) -> "Observation":
         """The same observation for `batch` starts, without a copy."""
@@ -116,8 +126,10 @@ class Observation:
     def share(self, index: Tensor) -> "Observation":
         """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames."""
         few = replace(self, nearest=self.nearest[:1]).take(index)
-        return few if len(self.nearest) == 1 else replace(
-            few, nearest=self.nearest, frame=index if self.frame is None else self.frame[index]
+        return (
+            few
+            if len(self.nearest) == 1
+            else replace(few, nearest=self.nearest, frame=index if self.frame is None else self.frame[index])
         )
 
 
@@ -310,9 +322,12 @@ class Registrar(nn.Module):
             weight = ((best > none) & cloud.mask[:, None]).to(belief)
             part = part.gather(1, index)
             feet = feet.gather(1, index[:, :, None].expand(-1, -1, 9, -1))
-        support = weight.new_zeros(len(part), K, part.shape[2]).scatter(1, part, weight).sum(2)
         target = cloud.points.mT.repeat(1, 1, part.shape[1])
         part, weight, feet = part.flatten(1), weight.flatten(1), feet.transpose(1, 2).flatten(2)
+        # What a point says of a limb's direction grows with the square of its distance from the joint.
+        joint = posed.origins[:, self.body.carriers[:K]].mT.gather(2, part[:, None].expand(-1, 3, -1))
+        lever = (target - joint).square().sum(1) / config.rest_lever**2
+        support = weight.new_zeros(len(part), K).scatter_add(1, part, weight * lever.clamp_max(1))
         local, normal, gap = feet.split(3, 1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
