@@ -342,7 +342,10 @@ class Eyes(nn.Module):
         with self.stopwatch.measure("points"):
             cloud = sample_grid(view.depth, silhouette, self.camera, self.config.sampling)
         with self.stopwatch.measure("faces"):
-            faces = self.find_faces(view.images, silhouette, view.depth, self.camera, face)
+            # A picture of the depth shows no face; an empty silhouette spares the search.
+            shown = silhouette if view.coloured else torch.zeros_like(silhouette)
+            faces = self.find_faces(view.images, shown, view.depth, self.camera, face)
+            faces = replace(faces, sought=view.coloured)
         present = int(cloud.mask.sum()) >= self.config.min_points
         cut = _touches_border(silhouette[0])
         return Sight(view.images, view.depth, silhouette, cloud, faces, present, cut, view.coloured)
