@@ -27,11 +27,10 @@ from torchpose.vision.background import (
     BackgroundModel,
     DepthBackground,
     DepthBackgroundConfig,
-    far_readings,
 )
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.disparity import bridge_gaps
-from torchpose.vision.empty_scene import EmptySceneConfig, learn_empty_scene
+from torchpose.vision.empty_scene import EmptySceneConfig, empty_depth, learn_empty_scene
 from torchpose.vision.faces import FaceConfig, FaceDetector, FaceMemory, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds
 from torchpose.vision.photometry import temporal_median
@@ -42,6 +41,7 @@ from torchpose.vision.skin import SkinModel
 from torchpose.vision.stereo import StereoConfig, stereo_matcher
 from torchpose.vision.windows import window_max
 
+PURE = 0.75  # share of a depth reading that must be the person's: with less it lies behind the body's surface
 NOBODY = -1e3  # log-odds of a pixel that has been given to somebody
 
 
@@ -52,6 +52,7 @@ class EyesConfig:
     nearest: float = 1.2  # m, of the person: with `farthest` it bounds the disparities that are searched
     farthest: float = 8.0  # m
     background_frames: int = 15  # of the recording, from which the empty scene is learned if none is given
+    depth_frames: int = 40  # the same for a depth camera, whose frames cost nothing and whose noise is large
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     empty_scene: EmptySceneConfig = field(default_factory=EmptySceneConfig)
     depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
@@ -74,8 +75,8 @@ class EyesConfig:
             raise ValueError(
                 f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}"
             )
-        if min(self.background_frames, self.min_points, self.range_scale, self.people) < 1:
-            raise ValueError("background_frames, min_points, range_scale and people must be at least 1")
+        if min(self.background_frames, self.depth_frames, self.min_points, self.range_scale, self.people) < 1:
+            raise ValueError("background_frames, depth_frames, min_points, range_scale and people must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -181,12 +182,16 @@ class Eyes(nn.Module):
 
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
         """Learn the empty scene from its frames, or where there are none from the recording itself."""
-        spread = spread_positions(len(recording), self.config.background_frames)
-        if self.camera.baseline is None:
-            depth = backgrounds.depth
+        depth_camera = self.camera.baseline is None
+        count = self.config.depth_frames if depth_camera else self.config.background_frames
+        spread = spread_positions(len(recording), count)
+        if depth_camera:
+            depth, config = backgrounds.depth, self.config.depth_background
             if depth is None:
-                depth = far_readings(_stack([frame.depth for frame in readable_frames(recording, spread)]))
-            self.background = DepthBackground(depth.to(device), self.config.depth_background)
+                frames = _stack([frame.depth for frame in readable_frames(recording, spread)])
+                depth = empty_depth(frames, config)
+                config = replace(config, drift=1.0)  # the frames are spread over all of the recording's
+            self.background = DepthBackground(depth.to(device), config)
             self.background_depth = self.background.depth
             return
         if backgrounds.left is not None and backgrounds.right is not None:
@@ -266,7 +271,9 @@ class Eyes(nn.Module):
             images = frame.left[None].to(device) if frame.left is not None else depth_picture(depth)
             grey = rgb_to_grayscale(images)[:, 0]
             with self.stopwatch.measure("background"):
+                assert isinstance(self.background, DepthBackground)
                 log_odds = self.background(depth)
+                surface = depth.where(self.background.front_share(depth) > PURE, torch.nan)
         else:
             assert frame.left is not None
             assert frame.right is not None
@@ -294,7 +301,7 @@ class Eyes(nn.Module):
             seen = depth.where(silhouette, torch.nan)
             matched = None if self.camera.baseline is None else self.camera.disparity(seen)
         self.last = LastSight(frame.time_s, silhouette, matched, None)
-        return View(images, depth, silhouette, frame.left is not None)
+        return View(images, depth if frame.depth is None else surface, silhouette, frame.left is not None)
 
     def _silhouette(
         self,
@@ -306,11 +313,19 @@ class Eyes(nn.Module):
     ) -> Bool[Tensor, "1 height width"]:
         """One silhouette after another, each of what is left of the foreground, until there is too little of it."""
         config = self.config.silhouette
+        sigma = self.background.sigma if isinstance(self.background, DepthBackground) else None
         everybody = torch.zeros_like(log_odds, dtype=torch.bool)
         fewest = config.min_area * log_odds[0].numel()
         for _ in range(most):
             one = person_silhouette(
-                log_odds, depth, config, self.background_depth, self.camera, guide=grey, previous=previous
+                log_odds,
+                depth,
+                config,
+                self.background_depth,
+                self.camera,
+                guide=grey,
+                previous=previous,
+                background_sigma=sigma,
             ).mask
             if not bool(one.any()):
                 break
@@ -327,7 +342,10 @@ class Eyes(nn.Module):
         with self.stopwatch.measure("points"):
             cloud = sample_grid(view.depth, silhouette, self.camera, self.config.sampling)
         with self.stopwatch.measure("faces"):
-            faces = self.find_faces(view.images, silhouette, view.depth, self.camera, face)
+            # A picture of the depth shows no face; an empty silhouette spares the search.
+            shown = silhouette if view.coloured else torch.zeros_like(silhouette)
+            faces = self.find_faces(view.images, shown, view.depth, self.camera, face)
+            faces = replace(faces, sought=view.coloured)
         present = int(cloud.mask.sum()) >= self.config.min_points
         cut = _touches_border(silhouette[0])
         return Sight(view.images, view.depth, silhouette, cloud, faces, present, cut, view.coloured)

@@ -21,6 +21,7 @@ Planes = Float[Tensor, "batch height width"]
 UNCHANGED, CHANGED = -6.0, 4.0
 SHADED, MIXED = -2.0, -4.0
 GLARING = (-1.0, 0.5)
+_MODE_STEPS = 4  # of the mean shift to the farthest mode of a pixel's readings
 CHANGED_SLOPE, SHADED_SLOPE = 4.0, 3.0  # log-odds by which a misfit of 1 more than the threshold counts
 
 
@@ -163,8 +164,11 @@ class DepthBackgroundConfig:
 
     noise_floor: float = 0.02  # m
     noise_growth: float = 0.003  # m per m^2: 3 cm at 3 m
+    drift: float = 2.0  # times the noise of successive frames: what a minute's drift makes of it
     outliers: float = 0.02  # share of readings that are anywhere
     max_depth: float = 10.0  # m, readings are believed up to here
+    mixing: int = 8  # px about an edge, within which a reading may mix what is before and what is behind it
+    ramp: float = 0.1  # share of the step from before to behind by which depth then grows in half of them
 
     def __post_init__(self) -> None:
         if not (self.noise_floor > 0 and self.noise_growth >= 0):
@@ -174,13 +178,20 @@ class DepthBackgroundConfig:
             raise ValueError(f"outliers must be in (0, 1), got {self.outliers}")
         if not self.max_depth > 0:
             raise ValueError(f"max_depth must be positive, got {self.max_depth}")
+        if not self.drift >= 1:
+            raise ValueError(f"drift must be at least 1, got {self.drift}")
+        if self.mixing < 0 or not 0 < self.ramp < 0.5:
+            raise ValueError(
+                f"mixing must not be negative (0 switches it off) and ramp in (0, 0.5), got {self.mixing} and "
+                f"{self.ramp}"
+            )
 
 
 class DepthBackground(nn.Module):
     """Foreground log-odds of a depth camera from the empty scene's depth; the noise grows as Z^2.
 
-    From three frames on the noise is measured too, its growth and where it is worse; twice what they show,
-    for a minute's drift is more than what successive frames differ by.
+    From three frames on the noise is measured too, its growth and where it is worse; `drift` times what they show, for
+    a minute's drift is more than what successive frames differ by.
     """
 
     depth: Plane  # m, NaN where the empty scene gave no reading
@@ -197,19 +208,25 @@ class DepthBackground(nn.Module):
             raise ValueError("the background needs at least 1 depth frame, got 0; record the empty scene")
         self.config = config
         frames = _clean_depth(frames, config.max_depth)
-        depth = frames.nanmedian(0).values
+        depth = _middle(frames)
         growth, spread = torch.full_like(depth[0, 0], config.noise_growth), torch.zeros_like(depth)
         if len(frames) >= 3:
             deviation = 1.4826 * (frames - depth).abs()
+            deviation = deviation.masked_fill(frames.isfinite().sum(0) < 3, torch.nan)
             measured = (deviation / depth.square()).nanmedian()
-            growth = torch.where(measured > 0, (2 * measured).clamp_min(config.noise_growth), growth)
-            spread = 2 * window_mean(deviation.nanmedian(0).values.nan_to_num().square(), 2).sqrt()
+            growth = torch.where(measured > 0, (config.drift * measured).clamp_min(config.noise_growth), growth)
+            square = deviation.nanmedian(0).values.square()
+            known = window_mean(square.isfinite().to(square.dtype), 2).clamp_min(1e-6)
+            spread = config.drift * (window_mean(square.nan_to_num(), 2) / known).sqrt()
         self.register_buffer("depth", depth, persistent=False)
         sigma = config.noise_floor + torch.maximum(growth * depth.square(), spread)
         self.register_buffer("sigma", sigma, persistent=False)
 
     def forward(self, depth: Planes) -> Planes:
-        """Log-odds in [-4, 4] of frames in metres: 0 without a reading, 1 if only the background has none."""
+        """Log-odds in [-4, 4] of frames in metres: 0 without a reading, 1 if only the background has none.
+
+        A reading that mixes the scene with what stands before it belongs to the side that gave it more than half.
+        """
         if depth.shape[-2:] != self.depth.shape:
             raise ValueError(
                 f"depth must have the background's size {tuple(self.depth.shape)}, "
@@ -220,17 +237,67 @@ class DepthBackground(nn.Module):
         foreground = foreground + config.outliers / config.max_depth
         background = reading_density(depth - self.depth, self.sigma, config.outliers, config.max_depth)
         log_odds = torch.where(self.depth.isnan(), 1, torch.log(foreground / background).clamp(-4, 4))
+        log_odds = torch.where(self.front_share(depth) < 0.5, MIXED, log_odds)
         return torch.where(depth.isnan(), 0, log_odds)
 
+    def front_share(self, depth: Planes) -> Planes:
+        """How much of each reading is of what stands before the scene: 1, and less where it is mixed with the scene.
 
-def far_readings(depth: Float[Tensor, "num height width"]) -> Float[Tensor, "num height width"]:
-    """The readings of each pixel that are the empty scene's, NaN elsewhere, m: those near the farthest.
+        Where a camera's window holds an edge, its readings lead from the depth before to that behind as a ramp. A
+        surface is none: there, depth does not grow to both sides by a share of the whole step.
+        """
+        radius = self.config.mixing
+        if radius == 0:
+            return torch.ones_like(depth)
+        depth = _clean_depth(depth, self.config.max_depth)
+        near = window_min(depth.nan_to_num(torch.inf), radius)
+        far = window_max(depth.nan_to_num(0.0), radius)
+        far = torch.where(self.depth.isnan(), far, torch.minimum(far, self.depth))
+        step = far - near
+        least, steep = self.config.ramp * step, torch.zeros_like(depth, dtype=torch.bool)
+        reach = max(1, radius // 2)
+        for axis in (-2, -1):
+            before, after = torch.roll(depth, reach, axis), torch.roll(depth, -reach, axis)
+            rise, fall = after - depth, depth - before
+            ramp = (torch.minimum(rise, fall) > least) | (torch.maximum(rise, fall) < -least)
+            size = depth.shape[axis]
+            inner = torch.arange(size, device=depth.device)
+            inner = (inner >= reach) & (inner < size - reach)  # `roll` brings in the other side
+            steep |= ramp & (inner[:, None] if axis == -2 else inner)
+        noise = torch.where(self.sigma.isnan(), self.config.noise_floor, self.sigma)
+        mixed = steep & (step > 3 * noise) & step.isfinite()
+        return torch.where(mixed, ((far - depth) / step).clamp(0, 1), 1.0)
 
-    Whoever walks through stands before the scene. The farthest reading itself is noise's choice, so the tenth from
-    the far end stands for it, and what lies within the noise of a depth camera around it belongs to it.
+
+def far_readings(
+    depth: Float[Tensor, "num height width"], config: DepthBackgroundConfig = DepthBackgroundConfig()
+) -> Float[Tensor, "num height width"]:
+    """The readings of each pixel that are the empty scene's, NaN elsewhere, m: those about the farthest mode.
+
+    Whoever walks through stands before the scene. From the tenth reading from the far end, for the farthest is noise's
+    choice, the middle of what lies within three standard deviations is taken, over and over, so that it is not drawn
+    to the far end. The noise is measured: over the image by the differences of successive frames, which few see a
+    person come or go in, and at a pixel by what is behind the middle, where nobody is.
     """
+    depth = _clean_depth(depth, config.max_depth)
     far = torch.nanquantile(depth, 0.9, dim=0)
-    return torch.where(depth > far - (0.05 + 0.01 * far**2), depth, torch.nan)
+    growth = depth.new_tensor(config.noise_growth)
+    if len(depth) >= 3:
+        change = 1.4826 * (depth[1:] - depth[:-1]).abs() / (2**0.5 * far.square())
+        growth = torch.fmax(growth, change.nanmedian())
+    for _ in range(_MODE_STEPS):
+        sigma = config.noise_floor + growth * far.square()
+        far = _middle(depth.where((depth - far).abs() <= 3 * sigma, torch.nan))
+    sigma = config.noise_floor + growth * far.square()
+    behind = (depth - far).where(depth > far, torch.nan)
+    count = window_mean(behind.isfinite().sum(0).to(depth.dtype), 2).clamp_min(1e-6)
+    sigma = torch.maximum(sigma, (window_mean(behind.square().nansum(0), 2) / count).sqrt())
+    return depth.where((depth - far).abs() <= 3 * sigma, torch.nan)
+
+
+def _middle(depth: Float[Tensor, "num height width"]) -> Plane:
+    """Median of each pixel's readings, the mean of the middle two where their number is even; NaN of none."""
+    return torch.nanquantile(depth, 0.5, dim=0)
 
 
 def _clean_depth(

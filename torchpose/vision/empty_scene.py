@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchpose.vision.background import DepthBackground, DepthBackgroundConfig, far_readings
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.disparity import StereoMatcher, nearest_known
 from torchpose.vision.photometry import temporal_median
@@ -23,6 +24,9 @@ Frames = Float[Tensor, "frames 3 height width"]
 Plane = Float[Tensor, "height width"]
 Planes = Float[Tensor, "frames height width"]
 Masks = Bool[Tensor, "frames height width"]
+LEAST_PERSON = 0.004  # share of the image, of somebody before the scene; less is noise
+BESIDE, BELOW = 0.15, 0.4  # of a person's height as far as it is found, around which the scene is not trusted
+LEAST_FRAMES = 3  # in which the scene must be seen
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,31 @@ def learn_empty_scene(
     scene = matcher(pair[0], pair[1], disparity_range=disparity_range).values[0]
     trusted = window_min(seen.to(scene.dtype), config.fattening) > 0
     return EmptyScene(shown[0], shown[1], continue_rows(scene, trusted), seen)
+
+
+def empty_depth(
+    depth: Float[Tensor, "frames height width"], config: DepthBackgroundConfig = DepthBackgroundConfig()
+) -> Planes:
+    """A depth camera's readings of the scene behind the people of a few frames, m; NaN where somebody may be.
+
+    Whoever stands before what is seen behind him at another time is found first. Around him nothing counts, for his
+    feet are as far away as the floor; where that leaves too few frames, the farthest readings are the scene's.
+    """
+    far = far_readings(depth, config)
+    log_odds = DepthBackground(far, config)(depth)
+    found = connected_pieces(window_min((log_odds > 0).to(depth.dtype), 1) > 0)
+    height, width = depth.shape[1:]
+    hidden = torch.zeros_like(depth, dtype=torch.bool)
+    large = found.area >= LEAST_PERSON * height * width
+    large[0] = False
+    for piece in large.nonzero()[:, 0].tolist():
+        left, top, wide, high = found.box[piece].tolist()
+        rows = slice(max(0, round(top - BESIDE * high)), round(top + (1 + BELOW) * high))
+        columns = slice(max(0, round(left - BESIDE * high)), round(left + wide + BESIDE * high))
+        hidden[int(found.image[piece]), rows, columns] = True
+    open_view = depth.masked_fill(hidden, torch.nan)
+    enough = open_view.isfinite().sum(0) >= LEAST_FRAMES
+    return torch.where(enough, open_view, far)
 
 
 def find_people(

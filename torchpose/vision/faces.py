@@ -107,6 +107,7 @@ class Faces:
     mask: Bool[Tensor, "batch height width"]  # face pixels: the box's ellipse on the silhouette
     position: Float[Tensor, "batch 3"]  # m, a point of the face's surface; NaN where none or without depth
     memory: FaceMemory | None = None  # for the next frame
+    sought: bool = True  # False: these images cannot show a face, so that none is found says nothing
 
 
 @dataclass(frozen=True)

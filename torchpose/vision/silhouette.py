@@ -89,6 +89,7 @@ def person_silhouette(
     camera: StereoCamera | None = None,
     guide: Float[Tensor, "batch guide_height guide_width"] | None = None,
     previous: Bool[Tensor, "batch previous_height previous_width"] | None = None,
+    background_sigma: Float[Tensor, "sigma_height sigma_width"] | None = None,
 ) -> Silhouette:
     """The person's silhouette: the posterior of colour and depth, and one connected part of it (T. Fig. 3.6).
 
@@ -104,6 +105,7 @@ def person_silhouette(
         camera: a stereo camera makes depth's noise `disparity_noise` Z^2 / (f b).
         guide: (B, H, W) grey images in [0, 1], whose edges the silhouette follows; None ties all neighbours alike.
         previous: (B, H, W) masks of the frames before; None, or an empty one, where there was nobody.
+        background_sigma: (H, W) m, noise of a reading of the empty scene as measured; None takes it by `config`.
 
     Raises ValueError where sizes differ.
     """
@@ -128,6 +130,8 @@ def person_silhouette(
     if camera is not None and camera.baseline is not None:
         growth = config.disparity_noise / (camera.focal_length * camera.baseline)
     sigma = config.noise_floor + growth * background_depth.square()
+    if background_sigma is not None:
+        sigma = background_sigma
     middle = _person_depth(log_odds, depth, background_depth - 3 * sigma)
     smallest = max(1, math.ceil(config.min_area * height * width))
     mask, probability = torch.zeros_like(log_odds, dtype=torch.bool), torch.zeros_like(log_odds)
