@@ -54,7 +54,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "limb_search",
         "start",
     ),
-    "tracking": ("kalman", "location", "smoother", "tracker"),
+    "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
         *("inference", "hmm", "codebook", "recognizer", "diary"),
