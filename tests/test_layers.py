@@ -51,6 +51,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "silhouette",
         "vem",
         "size",
+        "occlusion",
         "limb_search",
         "start",
     ),

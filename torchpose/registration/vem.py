@@ -75,7 +75,7 @@ class Observation:
 
     cloud: PointCloud
     potential: Float[Tensor, "batch num parts"]  # log-potentials of the appearance terms
-    nearest: Float[Tensor, "#batch height width 2"]  # `nearest_inside` of the silhouette
+    nearest: Float[Tensor, "masks height width 2"]  # `nearest_inside` of the silhouettes; one mask serves all rows
     camera: StereoCamera
     geodesic: GeodesicTerm | None = None
     frame: Int[Tensor, " batch"] | None = None  # whose row of `nearest` each row has; None: its own, or the one
