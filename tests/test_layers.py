@@ -51,10 +51,11 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "silhouette",
         "vem",
         "size",
+        "occlusion",
         "limb_search",
         "start",
     ),
-    "tracking": ("kalman", "location", "smoother", "partition", "tracker"),
+    "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "partition", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
         *("inference", "hmm", "codebook", "recognizer", "diary"),

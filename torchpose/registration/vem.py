@@ -58,7 +58,6 @@ class RegistrationConfig:
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
     rest_sd: float = 0.5  # rad, of the pull to the rest pose on joints of which nothing is seen; 0 is none
     rest_support: float = 5.0  # points on a limb that halve this pull, if they are
-    joint_reach: float = 0.0  # m from a limb's joint, within which points count less; 0 counts all alike
     rest_lever: float = 0.25  # m or more from its joint; nearer ones count less
     compile: bool = False  # by torch.compile: 2 to 3 times as fast at batch 1, after minutes of compiling
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
@@ -79,7 +78,7 @@ class RegistrationConfig:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("outlier", "robust_sd", "rest_sd", "tangential", "joint_reach"):
+        for name in ("outlier", "robust_sd", "rest_sd", "tangential"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
 
@@ -90,7 +89,7 @@ class Observation:
 
     cloud: PointCloud
     potential: Float[Tensor, "batch num parts"]  # log-potentials of the appearance terms
-    nearest: Float[Tensor, "#batch height width 2"]  # `nearest_inside` of the silhouette
+    nearest: Float[Tensor, "masks height width 2"]  # `nearest_inside` of the silhouettes; one mask serves all rows
     camera: StereoCamera
     geodesic: GeodesicTerm | None = None
     frame: Int[Tensor, " batch"] | None = (
@@ -330,11 +329,6 @@ class Registrar(nn.Module):
         lever = (target - joint).square().sum(1)
         far = (lever / config.rest_lever**2).clamp_max(1)
         support = weight.new_zeros(len(part), K).scatter_add(1, part, weight * far)
-        if config.joint_reach > 0:
-            # Near its joint a limb's skin is its neighbour's, too, and shows the limb's direction least.
-            limb = (self.body.carriers[:K] > 0)[part]
-            weight = torch.where(limb, weight * (lever / config.joint_reach**2).clamp_max(1), weight)
-        local, normal, gap = feet.split(3, 1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
         if config.robust_sd > 0:  # Geman and McClure

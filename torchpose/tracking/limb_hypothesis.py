@@ -37,7 +37,7 @@ class HypothesisConfig:
     hopeless: float = 30.0  # nats by which a place may be worse than where the limb is believed to be
     rounds: int = 3  # of these fits
     sigma: float = 0.05  # m, in the first of them
-    reach: tuple[int, ...] = (1, 3, 9)  # frames, to either side, from which places are tried
+    reach: tuple[int, ...] = (1, 2, 4, 8)  # frames, to either side, from which places are tried
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
 

@@ -27,7 +27,7 @@ FLOOR = 1e-6  # precision of every unknown of every frame, so that none is witho
 
 @dataclass(frozen=True)
 class SmoothingConfig:
-    sweeps: int = 2  # in which frames also start from their neighbours' poses
+    sweeps: int = 1  # in which frames also start from their neighbours' poses
     apart: float = 0.25  # rad by which a neighbour must differ for that
     rounds: int = 3  # of labelling and joint fitting; 0 leaves the frames as they were tracked
     steps: int = 2  # of Gauss and Newton in each
