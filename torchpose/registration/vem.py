@@ -329,6 +329,7 @@ class Registrar(nn.Module):
         lever = (target - joint).square().sum(1)
         far = (lever / config.rest_lever**2).clamp_max(1)
         support = weight.new_zeros(len(part), K).scatter_add(1, part, weight * far)
+        local, normal, gap = feet.split(3, 1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
         if config.robust_sd > 0:  # Geman and McClure
