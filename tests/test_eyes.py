@@ -1,4 +1,4 @@
-"""What a depth camera's eyes make of bad input: holes, equal frames, somebody there from the start or in the background.
+"""What a depth camera's eyes make of bad input: holes, equal frames, who is always there, who is in the background.
 
 A floor, a wall and a person's outline by rays; no part of it is shared with the code under test.
 """

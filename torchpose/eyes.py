@@ -199,12 +199,12 @@ class Eyes(nn.Module):
         count = self.config.depth_frames if depth_camera else self.config.background_frames
         spread = spread_positions(len(recording), count)
         if depth_camera:
-            frames = _stack([frame.depth for frame in readable_frames(recording, spread)])
-            config, scene = self.config.depth_background, self.config.empty_scene
+            seen = _stack([frame.depth for frame in readable_frames(recording, spread)])
+            config, rules = self.config.depth_background, self.config.empty_scene
             if backgrounds.depth is not None:
-                depth = clear_depth(backgrounds.depth, frames, self.camera, config, scene)
+                depth = clear_depth(backgrounds.depth, seen, self.camera, config, rules)
             else:
-                depth = empty_depth(frames, self.camera, config, scene)
+                depth = empty_depth(seen, self.camera, config, rules)
                 config = replace(config, drift=1.0)  # the frames are spread over all of the recording's
             self.background = DepthBackground(depth.to(device), config)
             self.background_depth = self.background.depth

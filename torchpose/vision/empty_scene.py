@@ -107,8 +107,8 @@ def learn_empty_scene(
 def empty_depth(
     depth: Float[Tensor, "frames height width"],
     camera: StereoCamera,
-    config: DepthBackgroundConfig = DepthBackgroundConfig(),
-    scene: EmptySceneConfig = EmptySceneConfig(),
+    config: DepthBackgroundConfig,
+    scene: EmptySceneConfig,
 ) -> Planes:
     """A depth camera's readings of the scene behind the people of a few frames, m; NaN where somebody may be.
 
@@ -138,8 +138,8 @@ def clear_depth(
     backgrounds: Float[Tensor, "num height width"],
     depth: Float[Tensor, "frames height width"],
     camera: StereoCamera,
-    config: DepthBackgroundConfig = DepthBackgroundConfig(),
-    scene: EmptySceneConfig = EmptySceneConfig(),
+    config: DepthBackgroundConfig,
+    scene: EmptySceneConfig,
 ) -> Float[Tensor, "more height width"]:
     """A depth camera's frames of the empty scene, NaN where somebody stands in one; warns of those who do.
 
@@ -166,7 +166,7 @@ def people_boxes(
     depth: Planes,
     far: Float[Tensor, "num height width"],
     camera: StereoCamera,
-    config: DepthBackgroundConfig = DepthBackgroundConfig(),
+    config: DepthBackgroundConfig,
 ) -> tuple[Masks, float]:
     """Boxes of whoever stands before the scene in each frame, with room about them, and the greatest height, m.
 
