@@ -30,7 +30,12 @@ from torchpose.vision.background import (
 )
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.disparity import bridge_gaps
-from torchpose.vision.empty_scene import EmptySceneConfig, empty_depth, learn_empty_scene
+from torchpose.vision.empty_scene import (
+    EmptySceneConfig,
+    clear_depth,
+    empty_depth,
+    learn_empty_scene,
+)
 from torchpose.vision.faces import FaceConfig, FaceDetector, FaceMemory, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds
 from torchpose.vision.photometry import temporal_median
@@ -41,6 +46,7 @@ from torchpose.vision.skin import SkinModel
 from torchpose.vision.stereo import StereoConfig, stereo_matcher
 from torchpose.vision.windows import window_max
 
+SURE = 3.0  # log-odds of a depth reading that is nobody's noise
 PURE = 0.75  # share of a depth reading that must be the person's: with less it lies behind the body's surface
 NOBODY = -1e3  # log-odds of a pixel that has been given to somebody
 
@@ -66,6 +72,9 @@ class EyesConfig:
     glance_margin: float = 0.8  # m around it: an arm may be too thin for the small images
     last_margin: float = 0.5  # m around the last frame's range
     least_matched: float = 0.7  # share of the foreground; with less the range was wrong, and all is searched
+    least_body: float = (
+        0.08  # m^2 that a depth camera must surely see of a person: head and shoulders are 0.1
+    )
     min_points: int = 60  # fewer points on the person are nobody
     people: int = 4  # at the most; 1 takes the largest silhouette for the person and all else for nothing
     beside: int = 3  # px around somebody that are nobody else's
@@ -75,8 +84,12 @@ class EyesConfig:
             raise ValueError(
                 f"0 < nearest < farthest must hold, in m, got {self.nearest} and {self.farthest}"
             )
+        if not self.least_body >= 0:
+            raise ValueError(f"least_body must not be negative, in m^2, got {self.least_body}")
         if min(self.background_frames, self.depth_frames, self.min_points, self.range_scale, self.people) < 1:
-            raise ValueError("background_frames, depth_frames, min_points, range_scale and people must be at least 1")
+            raise ValueError(
+                "background_frames, depth_frames, min_points, range_scale and people must be at least 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -186,10 +199,12 @@ class Eyes(nn.Module):
         count = self.config.depth_frames if depth_camera else self.config.background_frames
         spread = spread_positions(len(recording), count)
         if depth_camera:
-            depth, config = backgrounds.depth, self.config.depth_background
-            if depth is None:
-                frames = _stack([frame.depth for frame in readable_frames(recording, spread)])
-                depth = empty_depth(frames, config)
+            seen = _stack([frame.depth for frame in readable_frames(recording, spread)])
+            config, rules = self.config.depth_background, self.config.empty_scene
+            if backgrounds.depth is not None:
+                depth = clear_depth(backgrounds.depth, seen, self.camera, config, rules)
+            else:
+                depth = empty_depth(seen, self.camera, config, rules)
                 config = replace(config, drift=1.0)  # the frames are spread over all of the recording's
             self.background = DepthBackground(depth.to(device), config)
             self.background_depth = self.background.depth
@@ -329,13 +344,27 @@ class Eyes(nn.Module):
             ).mask
             if not bool(one.any()):
                 break
-            everybody = everybody | one
+            if sigma is None or self._is_body(one, log_odds, depth):
+                everybody = everybody | one
             taken = window_max(one.to(log_odds), self.config.beside) > 0
             log_odds = log_odds.masked_fill(taken, NOBODY)
             if float((log_odds > 0).sum()) < fewest:
                 break
             previous = None if previous is None else previous & ~taken
         return everybody
+
+    def _is_body(
+        self,
+        silhouette: Bool[Tensor, "1 height width"],
+        log_odds: Float[Tensor, "1 height width"],
+        depth: Float[Tensor, "1 height width"],
+    ) -> bool:
+        """Whether enough of a silhouette is surely before the scene: a depth camera's noise comes in large patches.
+
+        What is surely there is measured in m^2, so a patch that is far away must be as clear as one that is near.
+        """
+        sure = silhouette & (log_odds > SURE) & depth.isfinite()
+        return float((depth[sure] / self.camera.focal_length).square().sum()) >= self.config.least_body
 
     def sight(self, view: View, silhouette: Bool[Tensor, "1 height width"], face: FaceMemory | None) -> Sight:
         """Whom a silhouette shows, of a view's people; `face` is what his or her last sight remembers."""

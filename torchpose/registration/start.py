@@ -42,8 +42,6 @@ LEGS = (
 # Sitting, crouching and stepping back, each with the lean of the trunk that goes with it, rad.
 BENT = ((ARMS[1], LEGS[1], 0.2), (ARMS[1], LEGS[2], 0.35), (ARMS[6], LEGS[2], 0.35), (ARMS[1], LEGS[3], 0.1))
 
-MOST_TILT, FEWEST_TILTED = 0.6, 20  # rad, and points, of a person's slope before the camera
-
 
 @dataclass(frozen=True)
 class StartConfig:
@@ -55,7 +53,7 @@ class StartConfig:
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
     refresh_sigma: float = 0.05  # m, in a refresh's first round: all but a limb or two are right
-    face_yaws: tuple[float, ...] = (-75.0, -35.0, 0.0, 35.0, 75.0)  # degrees, tried when a face is seen, or none can be
+    face_yaws: tuple[float, ...] = (-75.0, -35.0, 0.0, 35.0, 75.0)  # degrees: a face is seen, or none can be
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
     back_penalty: float = 4.0  # nats that a pose turned away from the camera must make good
@@ -154,17 +152,14 @@ class Starter(nn.Module):
         heading = torch.tensor([radians(yaw) for yaw in yaws]).to(size)
         Y, L = len(heading), len(poses)
         zero = torch.zeros(Y * L).to(size)
-        # Upright is what the person's length shows, for the camera may look down; of bent legs it shows nothing.
-        tilt = torch.where(lean == 0, cloud_tilt(observation.cloud), 0.0)
-        root = tilted(heading.repeat_interleave(L), lean.repeat(Y), tilt.repeat(Y))
+        root = torch.stack([heading.repeat_interleave(L), lean.repeat(Y), zero], 1)
         # Whoever leans by an angle has the hips behind and higher up, seen from the head.
         away = torch.stack([zero, zero, torch.ones_like(zero)], -1)
-        yaw, forward = heading.repeat_interleave(L), lean.repeat(Y)[:, None]
-        back = (exp_rotation(torch.stack([zero, yaw, zero], -1)) @ away[..., None])[..., 0]
+        back = (exp_rotation(torch.stack([zero, root[:, 0], zero], -1)) @ away[..., None])[..., 0]
         pelvis = pelvis_position(observation.cloud, faces, size, self.body).expand(Y * L, 3)
         trunk = 0.65 * size[0, 0]
-        pelvis = pelvis + trunk * forward.sin() * back
-        pelvis = pelvis - trunk * (1 - forward.cos()) * torch.tensor([0.0, 1.0, 0.0]).to(size)
+        pelvis = pelvis + trunk * root[:, 1:2].sin() * back
+        pelvis = pelvis - trunk * (1 - root[:, 1:2].cos()) * torch.tensor([0.0, 1.0, 0.0]).to(size)
         return self.body.pose_from_directions(pelvis, root, directions.repeat(Y, 1, 1))
 
     def _exchange(
@@ -186,36 +181,12 @@ class Starter(nn.Module):
             combined[:, index] = pose[chosen][:, index]
         return combined
 
+    def turned_away(self, found: Registration) -> bool:
+        """Whether a registration (batch 1) shows the person's back."""
+        return bool(self._turned_away(found.pose)[0])
+
     def _turned_away(self, pose: Float[Tensor, "starts parameters"]) -> Bool[Tensor, " starts"]:
         return pose[:, 3].cos() < cos(0.6 * pi)
-
-
-def cloud_tilt(cloud: PointCloud) -> Float[Tensor, ""]:
-    """The angle (rad) by which the cloud of one frame leads away from the camera towards the feet.
-
-    Between the middles of its upper and its lower third, which single limbs do not move; 0 where there are few points.
-    """
-    points = cloud.points[0][cloud.mask[0]]
-    if len(points) < 2 * FEWEST_TILTED:
-        return points.new_zeros(())
-    third = len(points) // 3
-    order = points[points[:, 1].argsort()]
-    upper, lower = order[:third].median(0).values, order[-third:].median(0).values
-    way = lower - upper
-    return torch.atan2(way[2], way[1]).clamp(-MOST_TILT, MOST_TILT)
-
-
-def tilted(
-    yaw: Float[Tensor, " starts"], lean: Float[Tensor, " starts"], tilt: Float[Tensor, " starts"]
-) -> Float[Tensor, "starts 3"]:
-    """The root's yaw, pitch and roll of a heading and a forward lean under a turn about the camera's x axis, rad."""
-    zero = torch.zeros_like(yaw)
-    turn = exp_rotation(torch.stack([tilt, zero, zero], -1)) @ exp_rotation(torch.stack([zero, yaw, zero], -1))
-    turn = turn @ exp_rotation(torch.stack([lean, zero, zero], -1))
-    pitch = -turn[:, 1, 2].clamp(-1, 1).asin()
-    return torch.stack(
-        [torch.atan2(turn[:, 0, 2], turn[:, 2, 2]), pitch, torch.atan2(turn[:, 1, 0], turn[:, 1, 1])], -1
-    )
 
 
 def pelvis_position(

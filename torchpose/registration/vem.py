@@ -89,7 +89,9 @@ class Observation:
 
     cloud: PointCloud
     potential: Float[Tensor, "batch num parts"]  # log-potentials of the appearance terms
-    nearest: Float[Tensor, "masks height width 2"]  # `nearest_inside` of the silhouettes; one mask serves all rows
+    nearest: Float[
+        Tensor, "masks height width 2"
+    ]  # `nearest_inside` of the silhouettes; one mask serves all rows
     camera: StereoCamera
     geodesic: GeodesicTerm | None = None
     frame: Int[Tensor, " batch"] | None = (

@@ -212,7 +212,8 @@ class Tracker(nn.Module):
             self._known_stray = self._stray(found)
         else:
             self._known_stray = min(self._known_stray, stray)
-        if not self.acceptable(found):
+        # Without colours the way that the person faces is given at the start, not measured: none turns away unseen.
+        if not self.acceptable(found) or (not person.faces.sought and self.starter.turned_away(found)):
             anew = self.starter(observation, person.faces, size)
             if self.acceptable(anew):
                 found, status = anew, TrackStatus.recovered

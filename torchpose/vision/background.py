@@ -196,6 +196,7 @@ class DepthBackground(nn.Module):
 
     depth: Plane  # m, NaN where the empty scene gave no reading
     sigma: Plane  # m, standard deviation of a reading from it
+    roughness: Float[Tensor, ""]  # m per m^2, of the same noise, what neighbours on a surface differ by
 
     def __init__(
         self,
@@ -214,13 +215,20 @@ class DepthBackground(nn.Module):
             deviation = 1.4826 * (frames - depth).abs()
             deviation = deviation.masked_fill(frames.isfinite().sum(0) < 3, torch.nan)
             measured = (deviation / depth.square()).nanmedian()
-            growth = torch.where(measured > 0, (config.drift * measured).clamp_min(config.noise_growth), growth)
+            growth = torch.where(
+                measured > 0, (config.drift * measured).clamp_min(config.noise_growth), growth
+            )
             square = deviation.nanmedian(0).values.square()
             known = window_mean(square.isfinite().to(square.dtype), 2).clamp_min(1e-6)
             spread = config.drift * (window_mean(square.nan_to_num(), 2) / known).sqrt()
         self.register_buffer("depth", depth, persistent=False)
+        self.register_buffer("roughness", _roughness(frames[:8], self._reach), persistent=False)
         sigma = config.noise_floor + torch.maximum(growth * depth.square(), spread)
         self.register_buffer("sigma", sigma, persistent=False)
+
+    @property
+    def _reach(self) -> int:
+        return max(1, self.config.mixing // 2)
 
     def forward(self, depth: Planes) -> Planes:
         """Log-odds in [-4, 4] of frames in metres: 0 without a reading, 1 if only the background has none.
@@ -254,19 +262,36 @@ class DepthBackground(nn.Module):
         far = window_max(depth.nan_to_num(0.0), radius)
         far = torch.where(self.depth.isnan(), far, torch.minimum(far, self.depth))
         step = far - near
-        least, steep = self.config.ramp * step, torch.zeros_like(depth, dtype=torch.bool)
-        reach = max(1, radius // 2)
+        rough = 2 * 2**0.5 * self.roughness * depth.square()
+        least, steep = (
+            torch.maximum(self.config.ramp * step, rough),
+            torch.zeros_like(depth, dtype=torch.bool),
+        )
+        reach = self._reach
+        # A surface that slopes as the scene behind it does, or before a scene that slopes, is no ramp to it.
+        gap = torch.where(self.depth.isnan(), -depth, self.depth - depth)
         for axis in (-2, -1):
-            before, after = torch.roll(depth, reach, axis), torch.roll(depth, -reach, axis)
-            rise, fall = after - depth, depth - before
-            ramp = (torch.minimum(rise, fall) > least) | (torch.maximum(rise, fall) < -least)
             size = depth.shape[axis]
             inner = torch.arange(size, device=depth.device)
             inner = (inner >= reach) & (inner < size - reach)  # `roll` brings in the other side
-            steep |= ramp & (inner[:, None] if axis == -2 else inner)
+            ramp = (inner[:, None] if axis == -2 else inner).expand_as(depth)
+            for image in (depth, gap):
+                before, after = torch.roll(image, reach, axis), torch.roll(image, -reach, axis)
+                rise, fall = after - image, image - before
+                ramp = ramp & ((torch.minimum(rise, fall) > least) | (torch.maximum(rise, fall) < -least))
+            steep |= ramp
         noise = torch.where(self.sigma.isnan(), self.config.noise_floor, self.sigma)
         mixed = steep & (step > 3 * noise) & step.isfinite()
         return torch.where(mixed, ((far - depth) / step).clamp(0, 1), 1.0)
+
+
+def _roughness(frames: Float[Tensor, "frames height width"], reach: int) -> Float[Tensor, ""]:
+    """Noise of a reading against those `reach` px beside it, over Z^2, by second differences along the rows."""
+    if frames.shape[2] <= 2 * reach:
+        return frames.new_zeros(())
+    middle = frames[..., reach:-reach]
+    second = (frames[..., 2 * reach :] - 2 * middle + frames[..., : -2 * reach]).abs() / middle.square()
+    return (1.4826 / 6**0.5 * second.nanmedian()).nan_to_num(0.0)
 
 
 def far_readings(

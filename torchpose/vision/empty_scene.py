@@ -6,7 +6,7 @@ frame does, it stays unknown. Left-camera frame, metres; disparity in px, NaN wh
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,6 +27,7 @@ Masks = Bool[Tensor, "frames height width"]
 LEAST_PERSON = 0.004  # share of the image, of somebody before the scene; less is noise
 BESIDE, BELOW = 0.15, 0.4  # of a person's height as far as it is found, around which the scene is not trusted
 LEAST_FRAMES = 3  # in which the scene must be seen
+DISPARITY_NOISE = 0.2  # px, of a depth camera that is taken for a stereo camera
 
 
 @dataclass(frozen=True)
@@ -104,28 +105,90 @@ def learn_empty_scene(
 
 
 def empty_depth(
-    depth: Float[Tensor, "frames height width"], config: DepthBackgroundConfig = DepthBackgroundConfig()
+    depth: Float[Tensor, "frames height width"],
+    camera: StereoCamera,
+    config: DepthBackgroundConfig,
+    scene: EmptySceneConfig,
 ) -> Planes:
     """A depth camera's readings of the scene behind the people of a few frames, m; NaN where somebody may be.
 
     Whoever stands before what is seen behind him at another time is found first. Around him nothing counts, for his
-    feet are as far away as the floor; where that leaves too few frames, the farthest readings are the scene's.
+    feet are as far away as the floor; where that leaves too few frames, the farthest readings are the scene's. Where
+    nobody comes or goes, somebody may stay: who moves an arm is found by `find_people`, with its warning where
+    nobody moves at all, and what he hides is continued from the farther side of the row.
     """
     far = far_readings(depth, config)
-    log_odds = DepthBackground(far, config)(depth)
-    found = connected_pieces(window_min((log_odds > 0).to(depth.dtype), 1) > 0)
+    hidden, tallest = people_boxes(depth, far, camera, config)
+    if tallest >= scene.smallest:
+        open_view = depth.masked_fill(hidden, torch.nan)
+        enough = open_view.isfinite().sum(0) >= LEAST_FRAMES
+        return torch.where(enough, open_view, far)
+    # Noise that grows with the square of depth is the same everywhere in disparity, whatever the baseline.
+    as_stereo = replace(camera, baseline=DISPARITY_NOISE / (camera.focal_length * config.noise_growth))
+    people = find_people(as_stereo.disparity(depth), as_stereo, scene)
+    open_view = depth.masked_fill(people, torch.nan)
+    seen = open_view.isfinite().any(0)
+    middle = as_stereo.disparity(torch.where(seen, open_view, depth).nanmedian(0).values)
+    never = people.any(0) & ~seen
+    behind = as_stereo.depth(continue_rows(middle, seen))
+    return torch.where(never, behind, open_view)
+
+
+def clear_depth(
+    backgrounds: Float[Tensor, "num height width"],
+    depth: Float[Tensor, "frames height width"],
+    camera: StereoCamera,
+    config: DepthBackgroundConfig,
+    scene: EmptySceneConfig,
+) -> Float[Tensor, "more height width"]:
+    """A depth camera's frames of the empty scene, NaN where somebody stands in one; warns of those who do.
+
+    They are told by frames of the recording that see what is behind them, and where no background frame sees the
+    scene these frames' readings stand in: then some more frames follow.
+    """
+    far = far_readings(depth, config)
+    hidden, _ = people_boxes(backgrounds, far, camera, config)
+    wrong = hidden.flatten(1).any(1)
+    if not wrong.any():
+        return backgrounds
+    names = ", ".join(str(k) for k in wrong.nonzero()[:, 0].tolist())
+    warnings.warn(
+        f"somebody or something stands in the background that the recording sees behind, in {int(wrong.sum())} of "
+        f"{len(wrong)} background frames ({names}); what is behind is taken from the recording",
+        stacklevel=2,
+    )
+    clear = backgrounds.masked_fill(hidden, torch.nan)
+    missing = hidden.any(0) & ~clear.isfinite().any(0)
+    return torch.cat([clear, torch.where(missing, empty_depth(depth, camera, config, scene), torch.nan)])
+
+
+def people_boxes(
+    depth: Planes,
+    far: Float[Tensor, "num height width"],
+    camera: StereoCamera,
+    config: DepthBackgroundConfig,
+) -> tuple[Masks, float]:
+    """Boxes of whoever stands before the scene in each frame, with room about them, and the greatest height, m.
+
+    Args:
+        far: (K, H, W) m, readings of the scene, as `far_readings` gives them.
+    """
+    background = DepthBackground(far, config)
+    found = connected_pieces(window_min((background(depth) > 0).to(depth.dtype), 1) > 0)
     height, width = depth.shape[1:]
     hidden = torch.zeros_like(depth, dtype=torch.bool)
     large = found.area >= LEAST_PERSON * height * width
     large[0] = False
+    tallest = 0.0
     for piece in large.nonzero()[:, 0].tolist():
         left, top, wide, high = found.box[piece].tolist()
+        frame = int(found.image[piece])
+        distance = float(depth[frame][found.labels[frame] == piece].nanmedian())
+        tallest = max(tallest, high * distance / camera.focal_length)
         rows = slice(max(0, round(top - BESIDE * high)), round(top + (1 + BELOW) * high))
         columns = slice(max(0, round(left - BESIDE * high)), round(left + wide + BESIDE * high))
-        hidden[int(found.image[piece]), rows, columns] = True
-    open_view = depth.masked_fill(hidden, torch.nan)
-    enough = open_view.isfinite().sum(0) >= LEAST_FRAMES
-    return torch.where(enough, open_view, far)
+        hidden[frame, rows, columns] = True
+    return hidden, tallest
 
 
 def find_people(

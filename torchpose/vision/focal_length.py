@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.vision.background import DepthBackground
+from torchpose.vision.background import DepthBackground, DepthBackgroundConfig
 from torchpose.vision.silhouette import person_silhouette
 from torchpose.vision.windows import window_min
 
@@ -35,7 +35,8 @@ def focal_length_of_person(
 
     Raises ValueError where nobody is found, or where the image's border cuts the person in all frames.
     """
-    background = DepthBackground(empty)
+    # The feet's readings mix with the floor's: they would go with all others that do.
+    background = DepthBackground(empty, DepthBackgroundConfig(mixing=0))
     mask = person_silhouette(background(depth), depth, background_depth=background.depth).mask
     there = mask.flatten(1).any(1)
     if not there.any():
