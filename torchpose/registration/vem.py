@@ -75,10 +75,14 @@ class Observation:
 
     cloud: PointCloud
     potential: Float[Tensor, "batch num parts"]  # log-potentials of the appearance terms
-    nearest: Float[Tensor, "masks height width 2"]  # `nearest_inside` of the silhouettes; one mask serves all rows
+    nearest: Float[
+        Tensor, "masks height width 2"
+    ]  # `nearest_inside` of the silhouettes; one mask serves all rows
     camera: StereoCamera
     geodesic: GeodesicTerm | None = None
-    frame: Int[Tensor, " batch"] | None = None  # whose row of `nearest` each row has; None: its own, or the one
+    frame: Int[Tensor, " batch"] | None = (
+        None  # whose row of `nearest` each row has; None: its own, or the one
+    )
 
     def expand(self, batch: int) -> "Observation":
         """The same observation for `batch` starts, without a copy."""
@@ -110,8 +114,10 @@ class Observation:
     def share(self, index: Tensor) -> "Observation":
         """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames."""
         few = replace(self, nearest=self.nearest[:1]).take(index)
-        return few if len(self.nearest) == 1 else replace(
-            few, nearest=self.nearest, frame=index if self.frame is None else self.frame[index]
+        return (
+            few
+            if len(self.nearest) == 1
+            else replace(few, nearest=self.nearest, frame=index if self.frame is None else self.frame[index])
         )
 
 

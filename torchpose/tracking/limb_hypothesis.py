@@ -16,7 +16,6 @@ from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
 from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
-from torchpose.registration.size import stack_observations
 from torchpose.registration.start import thin
 from torchpose.registration.vem import Observation, Registrar, Registration
 from torchpose.tracking.trellis import best_sequence, spread, step_cost, weights
@@ -66,7 +65,9 @@ class Table:
         for _ in range(min(keep, rank.shape[2])):
             least, which = rank.min(2)
             index.append(which)
-            costs.append(torch.where(least < torch.inf, self.cost.gather(2, which[..., None])[..., 0], torch.inf))
+            costs.append(
+                torch.where(least < torch.inf, self.cost.gather(2, which[..., None])[..., 0], torch.inf)
+            )
             rank = torch.where(self._near(which, apart), torch.inf, rank)
         place = self.place.gather(2, torch.stack(index, 2)[..., None].expand(-1, -1, -1, self.place.shape[3]))
         cost = torch.stack(costs, 2)
@@ -103,7 +104,9 @@ class LimbHypotheses(nn.Module):
         names = [body.parameter_names[limb[0]] for limb in self.search.limbs.tolist()]
         # Arms compete for the same points, and so do legs: each limb and that of the other side.
         kinds = [_unsided(name) for name in names]
-        beside = [next((n for n, b in enumerate(kinds) if n != k and a == b), -1) for k, a in enumerate(kinds)]
+        beside = [
+            next((n for n, b in enumerate(kinds) if n != k and a == b), -1) for k, a in enumerate(kinds)
+        ]
         self.register_buffer("beside", torch.tensor(beside), persistent=False)
 
     def forward(
@@ -124,9 +127,7 @@ class LimbHypotheses(nn.Module):
         """
         T, P = pose.shape
         L = len(self.search.limbs)
-        few = stack_observations(
-            [thin(observation.take(torch.tensor([t], device=pose.device)), self.config.points) for t in range(T)]
-        )
+        few = thin(observation, self.config.points)
         size = size.expand(T, -1)
         work, limbs = _Work(self, few, size, rest_share), self.search.limbs
         table, pulls = work.start(pose), pull[:, limbs]
@@ -184,7 +185,9 @@ class _Work:
         cost = self.nats(torch.arange(T, device=pose.device), pose)
         return Table(pose[:, self.of.search.limbs][:, :, None], cost[:, None, None].expand(-1, L, -1).clone())
 
-    def nats(self, frame: Int[Tensor, " rows"], pose: Float[Tensor, "rows parameters"]) -> Float[Tensor, " rows"]:
+    def nats(
+        self, frame: Int[Tensor, " rows"], pose: Float[Tensor, "rows parameters"]
+    ) -> Float[Tensor, " rows"]:
         """Minus the log-density of frames at poses, with the pull to rest that counts in one frame of many."""
         registrar, out = self.of.registrar, []
         for t, p in zip(frame.split(MOST), pose.split(MOST), strict=True) if len(frame) else ():
@@ -242,7 +245,10 @@ class _Work:
 
     def _new(self, table: Table, place: Candidates) -> Bool[Tensor, "frames limbs candidates"]:
         """Those that differ from the table's and from those before them."""
-        apart, known = self.of.config.apart, torch.where(table.cost[..., None].isfinite(), table.place, torch.nan)
+        apart, known = (
+            self.of.config.apart,
+            torch.where(table.cost[..., None].isfinite(), table.place, torch.nan),
+        )
         known[:, :, 0] = table.place[:, :, 0]
         new = []
         for one in place.unbind(2):
