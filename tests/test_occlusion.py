@@ -25,7 +25,9 @@ def test_depths_are_those_of_marching_along_rays(scene):
     depth = torch.linspace(1.0, 6.0, 50001, dtype=torch.float64)
     for n in range(0, points.shape[1], 7):
         way = points[0, n] / points[0, n, 2]
-        local = torch.einsum("kij,ksi->ksj", posed.frames[0], depth[:, None] * way - posed.centers[0][:, None])
+        local = torch.einsum(
+            "kij,ksi->ksj", posed.frames[0], depth[:, None] * way - posed.centers[0][:, None]
+        )
         level = ((local / posed.radii[0][:, None]) ** 2).sum(-1)  # (K, steps)
         inside = level < 1
         front = torch.where(inside.any(1), depth[inside.int().argmax(1)], torch.inf)

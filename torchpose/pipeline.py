@@ -60,6 +60,7 @@ class PoseConfig:
     shape_sd: float = (
         0.05  # rad, by which a body that is not quite the person's misleads every joint, in all frames alike
     )
+    place_sd: float = 0.02  # m, the same for where the person is
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them
     height: float = 0.0  # m, of the person; 0 measures it
@@ -308,7 +309,7 @@ class StereoToPose(nn.Module):
         covariance = torch.cat([fit.covariance for fit in fits]) if fits else self.size.new_zeros(0, P, P)
         # Neither more points nor more frames take this away.
         shape = torch.full((P,), self.config.shape_sd**2).to(pose)
-        shape[:3] = 0
+        shape[:3] = self.config.place_sd**2
         covariance = covariance + torch.diag(shape)
         distance = torch.cat([fit.point_to_model for fit in fits]) if fits else self.size.new_zeros(0)
         posed = body(pose, self.size)

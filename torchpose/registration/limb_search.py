@@ -31,8 +31,10 @@ class LimbSearchConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.best <= self.shortlist <= self.candidates:
             raise ValueError(f"1 <= best <= shortlist <= candidates must hold, got {self}")
-        if not (self.sigma > 0 and self.apart >= 0):
-            raise ValueError(f"sigma must be positive, in m, and apart not negative, in rad, got {self}")
+        if not self.sigma > 0:
+            raise ValueError(f"sigma must be positive, in m, got {self.sigma}")
+        if self.apart < 0:
+            raise ValueError(f"apart must not be negative, in rad, got {self.apart}")
 
 
 class LimbSearch(nn.Module):

@@ -233,19 +233,22 @@ def _directions(
 
 
 def thin(observation: Observation, num: int) -> Observation:
-    """About `num` of the points, evenly along the grid; without neighbours, which thinning parts."""
+    """About `num` of each frame's points, evenly along the grid; without neighbours, which thinning parts."""
     cloud = observation.cloud
-    count = int(cloud.mask[0].sum())
-    if count <= num:
+    count = cloud.mask.sum(1, keepdim=True)
+    if bool((count <= num).all()):
         return observation
-    keep = torch.linspace(0, count - 1, num, device=cloud.mask.device).round().long()
-    index = cloud.mask[0].nonzero()[:, 0][keep]
-    neighbours = torch.full_like(cloud.neighbours[:, index], num)
-    thin = PointCloud(
-        points=cloud.points[:, index],
-        pixels=cloud.pixels[:, index],
-        grid=cloud.grid[:, index],
-        mask=cloud.mask[:, index],
-        neighbours=neighbours,
+    steps = torch.arange(num, device=cloud.mask.device)
+    even = (steps * (count - 1) / max(num - 1, 1)).round().long()
+    order = cloud.mask.to(torch.uint8).argsort(dim=1, descending=True, stable=True)  # points before padding
+    index = order.gather(1, torch.where(count > num, even, steps))
+    wide = index[..., None].expand(-1, -1, 3)
+    fewer = PointCloud(
+        points=cloud.points.gather(1, wide),
+        pixels=cloud.pixels.gather(1, wide[..., :2]),
+        grid=cloud.grid.gather(1, wide[..., :2]),
+        mask=cloud.mask.gather(1, index),
+        neighbours=torch.full_like(cloud.neighbours[:, :num], num),
     )
-    return Observation(thin, observation.potential[:, index], observation.nearest, observation.camera)
+    parts = index[..., None].expand(-1, -1, observation.potential.shape[2])
+    return Observation(fewer, observation.potential.gather(1, parts), observation.nearest, observation.camera)

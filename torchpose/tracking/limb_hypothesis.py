@@ -16,7 +16,6 @@ from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
 from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
-from torchpose.registration.size import stack_observations
 from torchpose.registration.start import thin
 from torchpose.registration.vem import Observation, Registrar, Registration
 from torchpose.tracking.trellis import best_sequence, spread, step_cost, weights
@@ -128,12 +127,16 @@ class LimbHypotheses(nn.Module):
         """
         T, P = pose.shape
         L = len(self.search.limbs)
+<<<<<<< HEAD
         few = stack_observations(
             [
                 thin(observation.take(torch.tensor([t], device=pose.device)), self.config.points)
                 for t in range(T)
             ]
         )
+=======
+        few = thin(observation, self.config.points)
+>>>>>>> chain
         size = size.expand(T, -1)
         work, limbs = _Work(self, few, size, rest_share), self.search.limbs
         table, pulls = work.start(pose), pull[:, limbs]
