@@ -127,16 +127,7 @@ class LimbHypotheses(nn.Module):
         """
         T, P = pose.shape
         L = len(self.search.limbs)
-<<<<<<< HEAD
-        few = stack_observations(
-            [
-                thin(observation.take(torch.tensor([t], device=pose.device)), self.config.points)
-                for t in range(T)
-            ]
-        )
-=======
         few = thin(observation, self.config.points)
->>>>>>> chain
         size = size.expand(T, -1)
         work, limbs = _Work(self, few, size, rest_share), self.search.limbs
         table, pulls = work.start(pose), pull[:, limbs]
