@@ -210,8 +210,11 @@ class DepthBackground(nn.Module):
         self.config = config
         frames = _clean_depth(frames, config.max_depth)
         depth = _middle(frames)
+        roughness = _roughness(frames[:8], self._reach)
         growth, spread = torch.full_like(depth[0, 0], config.noise_growth), torch.zeros_like(depth)
-        if len(frames) >= 3:
+        if len(frames) < 3:  # too few to tell noise over time: that between neighbouring readings stands for it
+            growth = torch.maximum(growth, 1.5 * roughness)
+        else:
             deviation = 1.4826 * (frames - depth).abs()
             deviation = deviation.masked_fill(frames.isfinite().sum(0) < 3, torch.nan)
             measured = (deviation / depth.square()).nanmedian()
@@ -222,7 +225,7 @@ class DepthBackground(nn.Module):
             known = window_mean(square.isfinite().to(square.dtype), 2).clamp_min(1e-6)
             spread = config.drift * (window_mean(square.nan_to_num(), 2) / known).sqrt()
         self.register_buffer("depth", depth, persistent=False)
-        self.register_buffer("roughness", _roughness(frames[:8], self._reach), persistent=False)
+        self.register_buffer("roughness", roughness, persistent=False)
         sigma = config.noise_floor + torch.maximum(growth * depth.square(), spread)
         self.register_buffer("sigma", sigma, persistent=False)
 
