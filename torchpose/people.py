@@ -53,11 +53,12 @@ class PeopleConfig:
     hidden_parts: int = (
         3  # of the body, that make a person partly visible; both feet are soon behind something
     )
+    mostly: float = 0.5  # of the body's parts hidden, above which a pose no longer says where somebody is
     memory: float = 2.0  # s for which the location of somebody unseen is believed
     pose_sd: float = 0.03  # m, of head and trunk as a pose has them
     same_clothes: float = 0.75  # similarity of colours, from which somebody who comes back is the same
     apart: float = 0.4  # m, least distance of two people's trunks seen from above
-    middle_sd: float = 0.15  # m by which the middle of a silhouette is off the trunk's
+    middle_sd: float = 0.25  # m by which the middle of a silhouette is off the trunk's
     strangeness: float = (
         2.0  # up to which a newcomer is somebody known: 1 for clothes at the limit above, 1 for a
     )
@@ -220,7 +221,13 @@ class People:
                 status = TrackStatus.lost
             if sight is not None:
                 with self.model.stopwatch.measure("people"):
-                    self._relocate(follower, sight, tracked.registration, time_s)
+                    # A pose from the few points of somebody mostly hidden is drawn to whatever hides the rest.
+                    body = expected[k]
+                    if (
+                        body is None
+                        or float(self._unseen(body, covered[k]).float().mean()) <= self.config.mostly
+                    ):
+                        self._relocate(follower, sight, tracked.registration, time_s)
             if sight is not None and tracked.registration is not None:
                 with self.model.stopwatch.measure("registration"):
                     follower.model.learn_colours(sight, tracked.registration)

@@ -212,7 +212,9 @@ class DepthBackground(nn.Module):
         depth = _middle(frames)
         roughness = _roughness(frames[:8], self._reach)
         growth, spread = torch.full_like(depth[0, 0], config.noise_growth), torch.zeros_like(depth)
-        if len(frames) < 3:  # too few to tell noise over time: that between neighbouring readings stands for it
+        if (
+            len(frames) < 3
+        ):  # too few to tell noise over time: that between neighbouring readings stands for it
             growth = torch.maximum(growth, 1.5 * roughness)
         else:
             deviation = 1.4826 * (frames - depth).abs()
