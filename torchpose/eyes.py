@@ -363,7 +363,12 @@ class Eyes(nn.Module):
 
         What is surely there is measured in m^2, so a patch that is far away must be as clear as one that is near.
         """
-        sure = silhouette & (log_odds > SURE) & depth.isfinite()
+        unknown = torch.zeros_like(silhouette)
+        if (
+            self.background_depth is not None
+        ):  # where the scene was never seen, nothing is surer than a reading
+            unknown = self.background_depth.isnan()[None].expand_as(silhouette)
+        sure = silhouette & ((log_odds > SURE) | unknown) & depth.isfinite()
         return float((depth[sure] / self.camera.focal_length).square().sum()) >= self.config.least_body
 
     def sight(self, view: View, silhouette: Bool[Tensor, "1 height width"], face: FaceMemory | None) -> Sight:
