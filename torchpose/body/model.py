@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from torchpose.body.skeleton import HUMAN, Hinges, SizedVector, load_skeleton
 from torchpose.geometry import axis_pair_angles, exp_rotation, rotation_and_left_jacobian, rotation_between
 
+STRAIGHT = 1e-6  # 1 - cosine, below which a limb goes on straight
+
 
 class JointKind(Enum):
     """How two degrees of freedom turn a limb: two parts of one rotation vector, or two hinges in a row."""
@@ -320,7 +322,11 @@ class BodyModel(nn.Module):
         cost = (
             (low - both).clamp_min(0).sum(-1) + (both - high).clamp_min(0).sum(-1) + 1e-3 * both.abs().sum(-1)
         )
-        return both[torch.arange(len(both)), cost.argmin(-1)]
+        first, second = both[torch.arange(len(both)), cost.argmin(-1)].unbind(-1)
+        # A first hinge along a limb that goes on straight only turns it about itself: rounding shall not twist a foot.
+        limb = self.limbs[joint].to(toward)
+        straight = ((limb * toward).sum(-1) > 1 - STRAIGHT) & ((axes[0] * limb).sum().abs() > 1 - STRAIGHT)
+        return torch.stack([torch.where(straight, 0.0, first), second], -1)
 
     def _turn(self, joint: int, angles: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch 3 3"]:
         axes = self.axes[6 + 2 * joint : 8 + 2 * joint].to(angles)
