@@ -206,7 +206,7 @@ class People:
                         None if sight is None else sight.faces,
                         follower.model.size,
                         cut,
-                        self.filter.pelvis(follower.location) if self._located(follower, time_s) else None,
+                        self._pelvis(follower, time_s),
                     )
                 )
             answers = track_together(asked)
@@ -241,12 +241,15 @@ class People:
         where = follower.location
         return bool(where.known[0]) and 0 <= time_s - float(where.time_s[0]) <= self.config.memory
 
+    def _pelvis(self, follower: Follower, time_s: float) -> Gaussian | None:
+        """The middle of the hips at `time_s`, m; None if nobody knows."""
+        if not self._located(follower, time_s):
+            return None
+        return self.filter.pelvis(self.filter.predict(follower.location, time_s))
+
     def _expected(self, follower: Follower, time_s: float) -> PosedBody | None:
         """Where the person's body should be at `time_s`; None if nobody knows."""
-        model = follower.model
-        place = None
-        if self._located(follower, time_s):
-            place = self.filter.pelvis(self.filter.predict(follower.location, time_s))
+        model, place = follower.model, self._pelvis(follower, time_s)
         expected = model.tracker.expect(time_s, place)
         if expected is not None:
             return model.body(expected.starts[:1], model.size)
