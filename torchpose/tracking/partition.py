@@ -13,7 +13,7 @@ from torchpose.body.ellipsoid import rough_distance
 from torchpose.body.model import PosedBody
 from torchpose.registration.silhouette import nearest_inside
 from torchpose.vision.camera import StereoCamera
-from torchpose.vision.pieces import Pieces, connected_pieces
+from torchpose.vision.pieces import connected_pieces
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,12 @@ class PartitionConfig:
     clear_share: float = 0.85  # of these that must be nearest to one person, to give that one the whole piece
     least_area: float = 0.08  # m^2 of a newcomer's surface
     least_height: float = 0.5  # m of a newcomer
+    aside: float = 0.45  # m, seen from above, by which pieces of one newcomer lie apart
 
     def __post_init__(self) -> None:
         if self.stride < 1:
             raise ValueError(f"stride must be at least 1 px, got {self.stride}")
-        for name in ("jump", "near", "least_area", "least_height"):
+        for name in ("jump", "near", "least_area", "least_height", "aside"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("known_share", "clear_share"):
@@ -48,7 +49,8 @@ def split_people(
 
     The silhouette falls into pieces where depth jumps. A piece near one expected body is that person's; one near
     several is split, every pixel to the nearest body, so that the nearest in depth wins where people overlap. A piece
-    near nobody is a newcomer if it is as large and as tall as somebody; smaller ones are nobody's.
+    near nobody is a newcomer's, together with others of these above and below it, if they are as large and as tall as
+    somebody; smaller ones are nobody's.
 
     Args:
         depth: m, NaN where unknown; such pixels follow the nearest pixel whose depth is known.
@@ -71,9 +73,9 @@ def split_people(
         least, nearest = distance.min(0)
         near, owner = least < config.near, nearest + 1
         owner = _of_pieces(owner, near, piece, len(pieces.area), people, config)
-    foreign = _newcomers(points, pixel, near, piece, pieces, camera, config)
-    for i, number in enumerate(foreign, people + 1):
-        owner = torch.where(piece == number, i, owner)
+    foreign = _newcomers(points, near, piece, len(pieces.area), camera, config)
+    for i, numbers in enumerate(foreign, people + 1):
+        owner = torch.where(torch.isin(piece, numbers), i, owner)
     decided = torch.zeros_like(mask, dtype=torch.long)  # 1 is nobody
     decided[rows, columns] = owner + 1
     # What was not judged, for want of depth or between two judged pixels, follows the nearest one.
@@ -118,25 +120,37 @@ def _of_pieces(
 
 def _newcomers(
     points: Float[Tensor, "points 3"],
-    pixel: Float[Tensor, "points 2"],
     near: Bool[Tensor, " points"],
     piece: Int[Tensor, " points"],
-    pieces: Pieces,
+    count: int,
     camera: StereoCamera,
     config: PartitionConfig,
-) -> list[int]:
-    """Numbers of the pieces that are nobody's and as large as a person, the largest first."""
-    count = len(pieces.area)
+) -> list[Int[Tensor, " numbers"]]:
+    """Numbers of the pieces of each newcomer, the largest newcomer first.
+
+    An arm before the hips parts the trunk from the legs, so pieces that are nobody's are taken together with the
+    largest one that lies above or below them.
+    """
     size = torch.bincount(piece, minlength=count)
     known = torch.bincount(piece[near], minlength=count)
-    pixel_area = (points[:, 2] * config.stride / camera.focal_length) ** 2
-    area = points.new_zeros(count).index_add(0, piece, pixel_area)
-    top, bottom = (
-        points.new_zeros(count).scatter_reduce(0, piece, points[:, 1], how, include_self=False)
-        for how in ("amin", "amax")
+    area = points.new_zeros(count).index_add(
+        0, piece, (points[:, 2] * config.stride / camera.focal_length) ** 2
     )
-    enough = (area >= config.least_area) & (bottom - top >= config.least_height)
-    enough &= known < config.known_share * size
-    enough[0] = False
-    order = area.argsort(descending=True)
-    return [int(number) for number in order[enough[order]]]
+    middle = points.new_zeros(count, 3).index_add(0, piece, points) / size.clamp_min(1)[:, None]
+    top, bottom = (
+        points.new_full((count,), start).scatter_reduce(0, piece, points[:, 1], how)
+        for start, how in ((torch.inf, "amin"), (-torch.inf, "amax"))
+    )
+    open_ = (size > 0) & (known < config.known_share * size)
+    open_[0] = False
+    groups = []
+    for number in area.argsort(descending=True):
+        if not bool(open_[number]):
+            continue
+        aside = (middle - middle[number])[:, [0, 2]].norm(dim=1)
+        group = (open_ & (aside < config.aside)).nonzero()[:, 0]
+        open_[group] = False
+        tall = bottom[group].max() - top[group].min()
+        if bool((area[group].sum() >= config.least_area) & (tall >= config.least_height)):
+            groups.append(group)
+    return groups
