@@ -59,6 +59,7 @@ class EyesConfig:
     farthest: float = 8.0  # m
     background_frames: int = 15  # of the recording, from which the empty scene is learned if none is given
     depth_frames: int = 40  # the same for a depth camera, whose frames cost nothing and whose noise is large
+    disparity_sd: float = 0.3  # px, of a matched disparity
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     empty_scene: EmptySceneConfig = field(default_factory=EmptySceneConfig)
     depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
@@ -192,6 +193,15 @@ class Eyes(nn.Module):
         ends = self.camera.disparity(torch.tensor([far + margin, max(near - margin, self.config.nearest)]))
         least, greatest = ends.tolist()
         return max(low, math.floor(least)), min(high, math.ceil(greatest))
+
+    @property
+    def depth_noise(self) -> float:
+        """Standard deviation of a depth, m, over its square: as the empty scene shows it, or as matching has it."""
+        if isinstance(self.background, DepthBackground):
+            return float(self.background.noise)
+        if self.camera.baseline is None:
+            return 0.0
+        return self.config.disparity_sd / (self.camera.focal_length * self.camera.baseline)
 
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
         """Learn the empty scene from its frames, or where there are none from the recording itself."""

@@ -12,11 +12,12 @@ from dataclasses import dataclass, field, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from torchpose.body.model import PosedBody
 from torchpose.export import JOINT_NAMES
 from torchpose.eyes import Sight, View
-from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
+from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose, upright_extent
 from torchpose.recording import Frame, Recording, UnreadableFrame
 from torchpose.registration.vem import Observation, Registration
 from torchpose.tracking.kalman import Gaussian
@@ -37,6 +38,9 @@ from torchpose.vision.head import HeadConfig, find_head
 from torchpose.vision.skin import SkinModel
 from torchpose.vision.trunk import TrunkConfig, find_trunk
 
+WALK = 0.8  # s over which somebody's way is measured
+TOUCHING = 3  # px between somebody and what may hide a part
+WHOLE = 3  # frames that show all of somebody, from which the height is taken: legs that stride are short
 FACE_TO_HEAD = (0.0, -0.06, 0.08)  # m, from a face's surface to the head's centre, as measured on `people`
 
 
@@ -64,11 +68,21 @@ class PeopleConfig:
     )
     # place two standard deviations off
     scraps: float = 0.2  # of a newcomer's pixels; who has fewer may be the newcomer
+    walking_speed: float = 0.5  # m/s, from which somebody faces the way he or she goes
     arrival: int = 3  # frames in which somebody further must be seen, before a pose is sought
     size_apart: float = 0.4  # s between the frames from which the size is measured on the way
 
     def __post_init__(self) -> None:
-        for name in ("before", "memory", "pose_sd", "size_apart", "apart", "middle_sd", "strangeness"):
+        for name in (
+            "before",
+            "memory",
+            "pose_sd",
+            "size_apart",
+            "apart",
+            "middle_sd",
+            "strangeness",
+            "walking_speed",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if not 0 <= self.same_clothes < 1:
@@ -91,12 +105,16 @@ class Follower:
         self.seen = 0  # frames with points
         self.known = False  # whether this person was ever there
         self.sized = sized
+        # s, and m to the right and away, of the trunk in the last `WALK` s
+        self.trail: Float[Tensor, "places 3"] = torch.zeros(0, 3, dtype=torch.float64)
+        self.extents: list[float] = []  # m, from head to foot in frames that show all of the person
         self.samples: list[tuple[float, Observation, Registration]] = []  # for the size
 
     def state(self) -> dict[str, Tensor]:
         """What the next frame starts from, as tensors."""
         numbers = torch.tensor([self.seen, self.known, self.sized, self.face_time], dtype=torch.float64)
         state = self.model.state() | {"follower": numbers}
+        state |= {"trail": self.trail}
         state |= {f"location_{name}": value for name, value in self.location.state().items()}
         if self.clothes is not None:
             state["clothes"] = self.clothes
@@ -117,6 +135,7 @@ class Follower:
             if name.startswith("location_")
         }
         self.location = Location.restore(where)
+        self.trail = state["trail"]
         self.clothes = state["clothes"].to(like) if "clothes" in state else None
         self.face = None
         if "face" in state:
@@ -195,6 +214,8 @@ class People:
                 arrived = follower is self.followers[0] or follower.seen >= self.config.arrival
                 follower.known |= there and arrived
                 observation = None
+                if sight is not None and there:
+                    self._measure_height(follower, sight, cover)
                 if sight is not None and there and (arrived or follower.known):
                     observation = follower.model.observe(sight, cover)
                 cut = sight is not None and (sight.cut or self._partly(body, cover))
@@ -207,6 +228,7 @@ class People:
                         follower.model.size,
                         cut,
                         self._pelvis(follower, time_s),
+                        self._walking(follower, time_s),
                     )
                 )
             answers = track_together(asked)
@@ -247,6 +269,19 @@ class People:
             return None
         return self.filter.pelvis(self.filter.predict(follower.location, time_s))
 
+    def _walking(self, follower: Follower, time_s: float) -> float | None:
+        """Yaw of the way that the person walks, rad; None for whoever stands, or nobody knows.
+
+        The filter's velocity answers to each step; where somebody was a while ago says more.
+        """
+        trail = follower.trail
+        if not self._located(follower, time_s) or len(trail) < 2:
+            return None
+        elapsed, way = float(trail[-1, 0] - trail[0, 0]), trail[-1, 1:] - trail[0, 1:]
+        if elapsed < 0.5 * WALK or float(way.norm()) < self.config.walking_speed * elapsed:
+            return None
+        return math.atan2(-float(way[0]), -float(way[1]))
+
     def _expected(self, follower: Follower, time_s: float) -> PosedBody | None:
         """Where the person's body should be at `time_s`; None if nobody knows."""
         model, place = follower.model, self._pelvis(follower, time_s)
@@ -279,7 +314,6 @@ class People:
                 self.followers.append(Follower(self.model.another(), sized=False))
                 own.append(nobody)
                 who = len(own) - 1
-                self._guess_height(self.followers[who], view, mask)
             own[who] = own[who] | mask
         return own
 
@@ -316,10 +350,20 @@ class People:
                 best, least = k, strange
         return best
 
-    def _guess_height(self, follower: Follower, view: View, mask: Bool[Tensor, "height width"]) -> None:
-        """A first size, until frames with poses tell it."""
-        sight = self.model.eyes.sight(view, mask[None], None)
-        follower.model.size = self.model.body.size_of_height(follower.model.measure_height([sight]))
+    def _measure_height(
+        self, follower: Follower, sight: Sight, covered: Bool[Tensor, "1 height width"] | None
+    ) -> None:
+        """A first size from frames that show all of the person, until frames with poses tell it better."""
+        if follower.sized or sight.cut or self.model.config.height:
+            return
+        if covered is not None:
+            near = max_pool2d(sight.silhouette.to(sight.depth), 2 * TOUCHING + 1, 1, TOUCHING) > 0
+            if bool((near & covered).any()):
+                return
+        follower.extents.append(upright_extent(sight))
+        if len(follower.extents) >= WHOLE:
+            height = follower.model.height_of(follower.extents)
+            follower.model.size = self.model.body.size_of_height(height)
 
     def _face(self, follower: Follower, time_s: float) -> FaceMemory | None:
         recent = 0 < time_s - follower.face_time < self.model.eyes.config.memory
@@ -394,6 +438,9 @@ class People:
             self.filter.begin(seen, time_s) if measured else self.filter.step(follower.location, seen, time_s)
         )
         follower.location = step.location
+        place = [time_s, *step.location.body.mean[0, [0, 2]].tolist()]
+        trail = torch.cat([follower.trail, follower.trail.new_tensor([place])])
+        follower.trail = trail[trail[:, 0] >= time_s - WALK]
 
     def _covered(
         self, follower: Follower, view: View, masks: list[Tensor], own: int, time_s: float

@@ -3,7 +3,7 @@
 Left-camera frame, metres and radians.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -45,6 +45,9 @@ from torchpose.tracking.smoother import Message, Smoother, SmoothingConfig
 from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import CellConfig, group_cells
+
+RIM = 0.03  # m by which a cloud falls short of a person: half a step of its grid at the head and at the feet
+LEAST_UPRIGHT = 0.83  # of the body file's height; whoever looks shorter sits or stoops
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,10 @@ class StereoToPose(nn.Module):
             geodesic = geodesic_term(cells, bounds, outlier=self.config.registration.outlier > 0)
         # A limb may lie outside of the silhouette where something stands before it.
         allowed = sight.silhouette if covered is None else sight.silhouette | covered
-        return Observation(sight.cloud, potential, nearest_inside(allowed), self.camera, geodesic)
+        noise = self.eyes.depth_noise
+        return Observation(
+            sight.cloud, potential, nearest_inside(allowed), self.camera, geodesic, None, noise
+        )
 
     def learn_background(self, recording: Recording) -> None:
         """Learn the empty scene of the recording."""
@@ -149,7 +155,7 @@ class StereoToPose(nn.Module):
         """Learn the recording's empty scene and the person's size and colours, and forget any other person.
 
         `glance` says whom a frame shows, None where that is not clear; without it the largest silhouette is the
-        person's. Returns whether anybody was seen.
+        person's. Returns whether anybody was seen whole.
         """
         known = read_size(Path(self.config.person), self.body) if self.config.person else None
         self.learn_background(recording)
@@ -161,7 +167,7 @@ class StereoToPose(nn.Module):
         sights = [sight for sight in map(look, frames) if sight is not None]
         with self.stopwatch.measure("size"):
             self.size = self.measure_size(sights, known)
-        return any(sight.present for sight in sights)
+        return any(sight.present and not sight.cut for sight in sights)
 
     def measure_size(
         self, sights: list[Sight], known: Float[Tensor, "1 sizes"] | None = None
@@ -172,7 +178,8 @@ class StereoToPose(nn.Module):
         """
         size = known
         if size is None:
-            size = self.body.size_of_height(self.config.height or self.measure_height(sights))
+            extents = [upright_extent(sight) for sight in sights if sight.present and not sight.cut]
+            size = self.body.size_of_height(self.config.height or self.height_of(extents))
         if self.config.size.rounds == 0 and self.config.colour.strength == 0:
             return size
         self.colour.forget()
@@ -211,18 +218,16 @@ class StereoToPose(nn.Module):
         if self.config.colour.strength > 0 and sight.coloured:
             self.colour.learn(self.evidence(sight), found.belief, found.distance)
 
-    def measure_height(self, sights: list[Sight]) -> float:
-        """The person's height, m: from the head's top to the lowest point, the greatest of the frames.
+    def height_of(self, extents: Sequence[float]) -> float:
+        """The person's height, m, from the `upright_extent` of whole sights.
 
-        Whoever stoops looks shorter, never taller, so of the frames with a whole person the second tallest counts
-        (the tallest may hold a stray point). Without a whole person it is the body file's height.
+        Whoever stoops looks shorter, never taller, so of three or more the second tallest counts (the tallest may
+        hold a stray point). Without any that may be somebody upright it is the body file's height.
         """
-        heights = sorted(_upright_extent(sight) for sight in sights if sight.present and not sight.cut)
+        heights = sorted(one + RIM for one in extents if one + RIM > LEAST_UPRIGHT * self.body.height)
         if not heights:
             return self.body.height
-        # The cloud's rim lies half a grid step inside the silhouette, at the head and at the feet.
-        measured = heights[-2] if len(heights) > 2 else heights[-1]
-        return min(max(measured + 0.03, 0.95 * self.body.height), 1.2 * self.body.height)
+        return min(heights[-2] if len(heights) > 2 else heights[-1], 1.2 * self.body.height)
 
     def forward(self, recording: Recording) -> Iterator[FramePose]:
         """Poses of a prepared recording's frames, in order and smoothed."""
@@ -371,7 +376,7 @@ class SmoothingWindow:
         return [replace(frame, observation=None) for frame in smooth[:count]]
 
 
-def _upright_extent(sight: Sight) -> float:
+def upright_extent(sight: Sight) -> float:
     """From the head's top down to the lowest point, m."""
     points = sight.cloud.points[0][sight.cloud.mask[0]]
     middle = points.median(0).values

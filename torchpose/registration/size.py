@@ -59,7 +59,8 @@ def stack_observations(observations: Sequence[Observation]) -> Observation:
             cell=torch.cat([term.cell for term in terms]),
             distance=torch.cat([term.distance for term in terms]),
         )
-    return Observation(cloud, potential, nearest, observations[0].camera, geodesic)
+    first = observations[0]
+    return Observation(cloud, potential, nearest, first.camera, geodesic, None, first.depth_noise)
 
 
 def fit_size(

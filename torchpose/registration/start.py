@@ -57,13 +57,20 @@ class StartConfig:
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
     back_penalty: float = 4.0  # nats that a pose turned away from the camera must make good
+    walking_yaws: tuple[float, ...] = (-35.0, 0.0, 35.0, 180.0)  # degrees from the way that somebody walks
+    backwards_penalty: float = 15.0  # nats that a pose turned against the way somebody walks must make good
 
     def __post_init__(self) -> None:
         for name in ("points", "rounds", "final_rounds", "finalists"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not (self.yaws and self.face_yaws):
-            raise ValueError("yaws and face_yaws need at least one angle each, in degrees")
+        if not (self.yaws and self.face_yaws and self.walking_yaws):
+            raise ValueError("yaws, face_yaws and walking_yaws need at least one angle each, in degrees")
+        if not (self.back_penalty >= 0 and self.backwards_penalty >= 0):
+            raise ValueError(
+                "back_penalty and backwards_penalty must not be negative, "
+                f"got {self.back_penalty} and {self.backwards_penalty}"
+            )
 
 
 class Starter(nn.Module):
@@ -80,15 +87,23 @@ class Starter(nn.Module):
         self.limb_search = LimbSearch(body, self.coarse, config.limbs)
 
     def forward(
-        self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
+        self,
+        observation: Observation,
+        faces: Faces,
+        size: Float[Tensor, "#batch sizes"],
+        walking: float | None = None,
     ) -> Registration:
-        """Register one frame (batch 1) without a known pose."""
-        starts = self.hypotheses(observation, faces, size)
-        found = self._search(observation, starts, size, self.config.sigma)
+        """Register one frame (batch 1) without a known pose.
+
+        `walking` is the yaw of the way the person walks, rad; a face that is seen says more.
+        """
+        walking = None if bool(faces.found[0]) else walking
+        starts = self.hypotheses(observation, faces, size, walking)
+        found = self._search(observation, starts, size, self.config.sigma, walking=walking)
         for _ in range(self.config.refreshes):
             if float(found.misfit) < self.config.good_misfit:
                 break
-            better = self.refresh(observation, found.pose, size)
+            better = self.refresh(observation, found.pose, size, walking=walking)
             if not bool(better.score < found.score):
                 break
             found = better
@@ -100,6 +115,7 @@ class Starter(nn.Module):
         pose: Float[Tensor, "1 parameters"],
         size: Float[Tensor, "#batch sizes"],
         prior: PosePrior | None = None,
+        walking: float | None = None,
     ) -> Registration:
         """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
         few = thin(observation, self.config.points)
@@ -108,7 +124,7 @@ class Starter(nn.Module):
         for own, best in zip(self.limb_search.limbs, limbs[:, 0], strict=True):
             together[:, own] = best[own]
         starts = torch.cat([pose, together, limbs.flatten(0, 1)])
-        return self._search(observation, starts, size, self.config.refresh_sigma, prior)
+        return self._search(observation, starts, size, self.config.refresh_sigma, prior, walking)
 
     def _search(
         self,
@@ -117,30 +133,40 @@ class Starter(nn.Module):
         size: Float[Tensor, "#batch sizes"],
         sigma: float,
         prior: PosePrior | None = None,
+        walking: float | None = None,
     ) -> Registration:
         """Every start is fitted on a few points, the limbs of the good ones are exchanged in all pairs, and the best
         few combinations are fitted on all points. The registration with the least misfit is returned."""
         few = thin(observation, self.config.points)
         rough = self.coarse(few, starts, size, _each(prior, len(starts)), self.config.rounds, sigma)
-        misfit = self._score(rough)
+        misfit = self.score(rough, walking)
         arms = self._exchange(rough.pose, misfit, ("upper_arm", "forearm"))
         legs = self._exchange(rough.pose, misfit, ("thigh", "shank"))
         combined = torch.cat([rough.pose, arms, legs])
         last = self.registrar.config.sigma_last
         again = self.coarse(few, combined, size, _each(prior, len(combined)), 1, last)
-        best = self._score(again).topk(min(self.config.finalists, len(combined)), largest=False).indices
+        best = (
+            self.score(again, walking).topk(min(self.config.finalists, len(combined)), largest=False).indices
+        )
         final = self.registrar(
             observation, again.pose[best], size, _each(prior, len(best)), self.config.final_rounds
         )
-        return final.take(self._score(final).argmin()[None])
+        return final.take(self.score(final, walking).argmin()[None])
 
-    def _score(self, found: Registration) -> Float[Tensor, " starts"]:
-        return found.score.nan_to_num(nan=torch.inf) + self.config.back_penalty * self._turned_away(
-            found.pose
-        )
+    def score(self, found: Registration, walking: float | None = None) -> Float[Tensor, " starts"]:
+        """The registrations' scores with what the way the person faces costs, nats: less is better."""
+        score = found.score.nan_to_num(nan=torch.inf)
+        score = score + self.config.back_penalty * self._turned_away(found.pose)
+        if walking is not None:
+            score = score + self.config.backwards_penalty * (1 - (found.pose[:, 3] - walking).cos()) / 2
+        return score
 
     def hypotheses(
-        self, observation: Observation, faces: Faces, size: Float[Tensor, "#batch sizes"]
+        self,
+        observation: Observation,
+        faces: Faces,
+        size: Float[Tensor, "#batch sizes"],
+        walking: float | None = None,
     ) -> Float[Tensor, "starts parameters"]:
         """Poses to start from: headings x arms, standing, and a few with bent legs."""
         # Without colours nothing else tells front from back: whoever comes before the camera is taken to face it.
@@ -150,6 +176,8 @@ class Starter(nn.Module):
         directions = torch.stack([_directions(arm, leg) for arm, leg, _ in poses]).to(size)
         lean = torch.tensor([lean for _, _, lean in poses]).to(size)
         heading = torch.tensor([radians(yaw) for yaw in yaws]).to(size)
+        if walking is not None:
+            heading = torch.tensor([walking + radians(yaw) for yaw in self.config.walking_yaws]).to(size)
         Y, L = len(heading), len(poses)
         zero = torch.zeros(Y * L).to(size)
         root = torch.stack([heading.repeat_interleave(L), lean.repeat(Y), zero], 1)
@@ -251,4 +279,5 @@ def thin(observation: Observation, num: int) -> Observation:
         neighbours=torch.full_like(cloud.neighbours[:, :num], num),
     )
     parts = index[..., None].expand(-1, -1, observation.potential.shape[2])
-    return Observation(fewer, observation.potential.gather(1, parts), observation.nearest, observation.camera)
+    potential = observation.potential.gather(1, parts)
+    return replace(observation, cloud=fewer, potential=potential, geodesic=None, frame=None)

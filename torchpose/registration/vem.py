@@ -55,6 +55,9 @@ class RegistrationConfig:
     tangential: float = 0.3  # weight of the residual along the surface; 1: the distance to a fixed foot
     robust_sd: float = 0.05  # m, at which a residual loses three quarters of its weight; 0 weighs all alike
     noise_sd: float = 0.02  # m, of a point in the M-step
+    ray_sd: float = (
+        0.03  # m along the ray, up to which the settings above hold; noisier points count as if so far off
+    )
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
     rest_sd: float = 0.5  # rad, of the pull to the rest pose on joints of which nothing is seen; 0 is none
     rest_support: float = 5.0  # points on a limb that halve this pull, if they are
@@ -72,6 +75,7 @@ class RegistrationConfig:
             "sigma_first",
             "sigma_last",
             "noise_sd",
+            "ray_sd",
             "effective_points",
             "rest_support",
             "rest_lever",
@@ -97,6 +101,7 @@ class Observation:
     frame: Int[Tensor, " batch"] | None = (
         None  # whose row of `nearest` each row has; None: its own, or the one
     )
+    depth_noise: float = 0.0  # 1/m: a point's standard deviation along its ray, m, over its squared depth
 
     def expand(self, batch: int) -> "Observation":
         """The same observation for `batch` starts, without a copy."""
@@ -113,7 +118,13 @@ class Observation:
                 geodesic.most,
             )
         return Observation(
-            cloud, _rows(self.potential, batch), self.nearest, self.camera, geodesic, self.frame
+            cloud,
+            _rows(self.potential, batch),
+            self.nearest,
+            self.camera,
+            geodesic,
+            self.frame,
+            self.depth_noise,
         )
 
     def take(self, index: Tensor) -> "Observation":
@@ -123,7 +134,9 @@ class Observation:
         geodesic = self.geodesic
         if geodesic is not None:
             geodesic = replace(geodesic, cell=geodesic.cell[index], distance=geodesic.distance[index])
-        return Observation(cloud, self.potential[index], nearest, self.camera, geodesic)
+        return Observation(
+            cloud, self.potential[index], nearest, self.camera, geodesic, None, self.depth_noise
+        )
 
     def share(self, index: Tensor) -> "Observation":
         """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames."""
@@ -259,12 +272,36 @@ class Registrar(nn.Module):
         if not config.hard:
             part = torch.arange(K, device=points.device)[:, None].expand(len(points), K, points.shape[1])
             foot = foot_point(posed, points, config.visible)
-            return Correspondence(part, foot, foot.residual.square().sum(-1))
+            return Correspondence(part, foot, self._square(posed, part, foot, observation))
         # A point's label is one of the nearest parts; those far off need no foot point to be told apart from these.
         rough = rough_distance(posed, points, config.visible).square()
         part = rough.detach().topk(min(config.near, K), 1, largest=False).indices
         foot = foot_of_part(posed, part, points, config.visible)
-        return Correspondence(part, foot, rough.scatter(1, part, foot.residual.square().sum(-1)))
+        return Correspondence(
+            part, foot, rough.scatter(1, part, self._square(posed, part, foot, observation))
+        )
+
+    def _trust(self, observation: Observation) -> Float[Tensor, "batch num"]:
+        """How much a residual along each point's ray counts: less where it is noise more than `ray_sd`."""
+        noise = observation.depth_noise * observation.cloud.points[..., 2].square()
+        return (self.config.ray_sd / noise.clamp_min(self.config.ray_sd)).to(noise)
+
+    def _square(
+        self,
+        posed: PosedBody,
+        part: Int[Tensor, "batch few num"],
+        foot: FootPoint,
+        observation: Observation,
+    ) -> Float[Tensor, "batch few num"]:
+        """Squared distances from foot points, m^2, in which noise along the ray counts as `ray_sd`."""
+        square = foot.residual.square().sum(-1)
+        if observation.depth_noise == 0:
+            return square
+        ray = nn.functional.normalize(observation.cloud.points, dim=-1)  # (B, N, 3)
+        frames = posed.frames.flatten(2).gather(1, part.flatten(1)[..., None].expand(-1, -1, 9))
+        frames = frames.view(*part.shape, 3, 3)
+        along = ((frames.mT @ ray[:, None, :, :, None])[..., 0] * foot.residual).sum(-1)
+        return square - (1 - self._trust(observation).square())[:, None] * along.square()
 
     def label(
         self, posed: PosedBody, foot: Correspondence, observation: Observation, sigma: float
@@ -291,7 +328,7 @@ class Registrar(nn.Module):
         rim: bool = True,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
         """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
-        rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud)
+        rows, support = self._point_rows(posed, foot, labelling.belief, observation)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(
                 posed, observation.nearest, observation.camera, self.config.rim, observation.frame
@@ -308,22 +345,23 @@ class Registrar(nn.Module):
         posed: PosedBody,
         foot: Correspondence,
         belief: Float[Tensor, "batch labels num"],
-        cloud: PointCloud,
+        observation: Observation,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
         """Three rows for each pair of point and part, all first coordinates first; and the points on each part.
 
         In memory the coordinates stand before the pairs, so that every operation runs along the pairs.
         """
-        config, K = self.config, self.body.num_parts
+        config, K, cloud = self.config, self.body.num_parts, observation.cloud
         weight = belief.gather(1, foot.part)
-        feet = torch.cat([foot.foot.local, foot.foot.normal, foot.foot.residual], -1).mT  # (B, few, 9, N)
+        square = foot.square.gather(1, foot.part)[..., None]
+        feet = torch.cat([foot.foot.local, foot.foot.normal, square], -1).mT  # (B, few, 7, N)
         part = foot.part
         if config.hard:
             best, index = weight.max(1, keepdim=True)  # far faster than `argmax`
             none = belief[:, K:].amax(1, keepdim=True) if belief.shape[1] > K else torch.zeros_like(best)
             weight = ((best > none) & cloud.mask[:, None]).to(belief)
             part = part.gather(1, index)
-            feet = feet.gather(1, index[:, :, None].expand(-1, -1, 9, -1))
+            feet = feet.gather(1, index[:, :, None].expand(-1, -1, 7, -1))
         target = cloud.points.mT.repeat(1, 1, part.shape[1])
         part, weight, feet = part.flatten(1), weight.flatten(1), feet.transpose(1, 2).flatten(2)
         # What a point says of a limb's direction grows with the square of its distance from the joint.
@@ -331,11 +369,11 @@ class Registrar(nn.Module):
         lever = (target - joint).square().sum(1)
         far = (lever / config.rest_lever**2).clamp_max(1)
         support = weight.new_zeros(len(part), K).scatter_add(1, part, weight * far)
-        local, normal, gap = feet.split(3, 1)
+        local, normal, gap = feet.split((3, 3, 1), 1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
         if config.robust_sd > 0:  # Geman and McClure
-            weight = weight / (1 + gap.square().sum(1) / config.robust_sd**2) ** 2
+            weight = weight / (1 + gap[:, 0] / config.robust_sd**2) ** 2
         # The root of 0 has no derivative; the floor gives it 0.
         tiny = torch.finfo(weight.dtype).tiny
         scale = torch.where(weight > 0, weight.clamp_min(tiny).sqrt(), 0.0) / config.noise_sd
@@ -346,6 +384,13 @@ class Registrar(nn.Module):
         eye = torch.eye(3, dtype=normal.dtype, device=normal.device)[..., None]
         outer = normal[:, :, None] * normal[:, None]
         spread = (1 - config.tangential) * outer + config.tangential * eye  # (B, 3, 3, pairs), symmetric
+        if observation.depth_noise > 0:  # a residual along the ray is noise, mostly
+            ray = nn.functional.normalize(cloud.points, dim=-1).mT.repeat(
+                1, 1, part.shape[1] // cloud.points.shape[1]
+            )
+            along = (ray[:, :, None] * spread).sum(1)  # (B, 3, pairs)
+            less = (1 - self._trust(observation)).repeat(1, part.shape[1] // cloud.points.shape[1])
+            spread = spread - less[:, None, None] * ray[:, :, None] * along[:, None]
         direction = (scale[:, None, None] * spread).flatten(2)
         local, target, direction = (x.mT for x in (local.repeat(1, 1, 3), target.repeat(1, 1, 3), direction))
         return Rows(part.repeat(1, 3), local, target, direction, part.shape[1]), support
@@ -388,12 +433,13 @@ class Registrar(nn.Module):
         covariance = torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.foot.distance.amin(1) * cloud.mask
+        fit = foot.square.gather(1, foot.part).amin(1).clamp_min(0).sqrt() * cloud.mask
         # Of the rows the points' come first; the bound stands in for them, with every label and none.
         rims = rows.residual(posed)[:, self._point_row_count(cloud) :]
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
         others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
         score = others - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
-        misfit = nearest.clamp_max(0.2).sum(1) / count
+        misfit = fit.clamp_max(0.2).sum(1) / count
         if config.rim.weight > 0:
             misfit = misfit + overhang_of(rims, config.rim)
         return Registration(

@@ -46,6 +46,7 @@ class TrackingConfig:
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
+    against: float = 1.75  # rad off the way somebody walks, from which the other way round is tried, too
     search_slack: float = (
         3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
     )
@@ -65,6 +66,7 @@ class TrackingConfig:
             "retry",
             "look_around",
             "search_slack",
+            "against",
             "memory",
         ):
             if not getattr(self, name) > 0:
@@ -106,11 +108,13 @@ class Tracker(nn.Module):
         self._known_stray = 0.0
         self._looked = -math.inf  # when limbs were last sought elsewhere, s
         self._failed = -math.inf  # when a search last found nothing, s
+        self._turned = -math.inf  # when it was last tried the other way round, s
 
     def state(self) -> dict[str, Tensor]:
         """What the next frame starts from, as tensors; empty where nothing is remembered."""
         poses: dict[str, Tensor] = {}
         memory = {} if self._failed == -math.inf else {"failed": self._failed}
+        memory |= {} if self._turned == -math.inf else {"turned": self._turned}
         if self._pose is not None:
             poses["pose"] = self._pose
             memory |= {"time": self._time, "known_stray": self._known_stray, "looked": self._looked}
@@ -123,6 +127,8 @@ class Tracker(nn.Module):
         self.forget()
         if "failed" in state:
             self._failed = float(state["failed"])
+        if "turned" in state:
+            self._turned = float(state["turned"])
         if "pose" in state:
             self._pose, self._time = state["pose"].to(self.body.axes), float(state["time"])
             self._velocity = state["velocity"].to(self.body.axes) if "velocity" in state else None
@@ -140,6 +146,7 @@ class Tracker(nn.Module):
         size: Float[Tensor, "#batch sizes"],
         cut: bool = False,
         root: Gaussian | None = None,
+        walking: float | None = None,
     ) -> TrackedFrame:
         """The person's pose at `time_s`.
 
@@ -148,8 +155,9 @@ class Tracker(nn.Module):
             faces: of the same frame, for a cold start.
             cut: part of the person may lie outside the image, or behind something.
             root: the middle of the hips as the person's location has it, m, batch 1; None where nothing is known.
+            walking: yaw of the way that the person walks, rad; None for whoever stands, or nobody knows.
         """
-        return track_together([Person(self, time_s, observation, faces, size, cut, root)])[0]
+        return track_together([Person(self, time_s, observation, faces, size, cut, root, walking)])[0]
 
     def expect(self, time_s: float, root: Gaussian | None = None) -> Expected | None:
         """Where the pose is at `time_s`, and how surely, as earlier frames and the location have it.
@@ -186,7 +194,7 @@ class Tracker(nn.Module):
             return expected
         if 0 <= person.time_s - self._failed < self.config.retry:
             return TrackedFrame(TrackStatus.entering, None)
-        found = self.starter(person.observation, person.faces, person.size)
+        found = self.starter(person.observation, person.faces, person.size, person.walking)
         if not self.acceptable(found):
             self._failed = person.time_s
             return TrackedFrame(TrackStatus.entering, None)
@@ -212,9 +220,20 @@ class Tracker(nn.Module):
             self._known_stray = self._stray(found)
         else:
             self._known_stray = min(self._known_stray, stray)
+        face = bool(person.faces.found[0])
+        if person.walking is not None and not face and self._against(found, person.walking, time_s):
+            self._turned = time_s
+            anew = self.starter(observation, person.faces, size, person.walking)
+            scores = [float(self.starter.score(one, person.walking)) for one in (found, anew)]
+            if self.acceptable(anew) and scores[1] < scores[0]:
+                found, status = anew, TrackStatus.recovered
+                self.forget()
+                self._turned = time_s
         # Without colours the way that the person faces is given at the start, not measured: none turns away unseen.
-        if not self.acceptable(found) or (not person.faces.sought and self.starter.turned_away(found)):
-            anew = self.starter(observation, person.faces, size)
+        # Whose face is seen does not turn away either.
+        away = self.starter.turned_away(found) and (face or not person.faces.sought)
+        if not self.acceptable(found) or away:
+            anew = self.starter(observation, person.faces, size, person.walking)
             if self.acceptable(anew):
                 found, status = anew, TrackStatus.recovered
                 self.forget()  # the way here from the last pose is a jump, no velocity
@@ -222,6 +241,11 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.lost, None)
         self._remember(found, time_s)
         return TrackedFrame(status, found)
+
+    def _against(self, found: Registration, walking: float, time_s: float) -> bool:
+        """Whether a pose goes backwards, which has not been doubted of late."""
+        off = math.remainder(float(found.pose[0, 3]) - walking, 2 * math.pi)
+        return abs(off) > self.config.against and time_s - self._turned >= self.config.retry
 
     def _stray(self, found: Registration) -> float:
         """Share of the points that are believed to be of no part."""
@@ -251,6 +275,7 @@ class Person:
     size: Float[Tensor, "#batch sizes"]
     cut: bool = False
     root: Gaussian | None = None
+    walking: float | None = None
 
 
 def track_together(people: Sequence[Person]) -> list[TrackedFrame]:

@@ -197,6 +197,7 @@ class DepthBackground(nn.Module):
     depth: Plane  # m, NaN where the empty scene gave no reading
     sigma: Plane  # m, standard deviation of a reading from it
     roughness: Float[Tensor, ""]  # m per m^2, of the same noise, what neighbours on a surface differ by
+    noise: Float[Tensor, ""]  # m per m^2, standard deviation of a reading over its squared depth
 
     def __init__(
         self,
@@ -211,6 +212,7 @@ class DepthBackground(nn.Module):
         frames = _clean_depth(frames, config.max_depth)
         depth = _middle(frames)
         roughness = _roughness(frames[:8], self._reach)
+        noise = roughness
         growth, spread = torch.full_like(depth[0, 0], config.noise_growth), torch.zeros_like(depth)
         if (
             len(frames) < 3
@@ -220,6 +222,7 @@ class DepthBackground(nn.Module):
             deviation = 1.4826 * (frames - depth).abs()
             deviation = deviation.masked_fill(frames.isfinite().sum(0) < 3, torch.nan)
             measured = (deviation / depth.square()).nanmedian()
+            noise = torch.maximum(roughness, measured.nan_to_num(0.0))
             growth = torch.where(
                 measured > 0, (config.drift * measured).clamp_min(config.noise_growth), growth
             )
@@ -228,6 +231,7 @@ class DepthBackground(nn.Module):
             spread = config.drift * (window_mean(square.nan_to_num(), 2) / known).sqrt()
         self.register_buffer("depth", depth, persistent=False)
         self.register_buffer("roughness", roughness, persistent=False)
+        self.register_buffer("noise", noise, persistent=False)
         sigma = config.noise_floor + torch.maximum(growth * depth.square(), spread)
         self.register_buffer("sigma", sigma, persistent=False)
 
