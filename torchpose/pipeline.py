@@ -142,7 +142,9 @@ class StereoToPose(nn.Module):
             geodesic = geodesic_term(cells, bounds, outlier=self.config.registration.outlier > 0)
         # A limb may lie outside of the silhouette where something stands before it.
         allowed = sight.silhouette if covered is None else sight.silhouette | covered
-        noise = self.eyes.depth_noise
+        z, noise = sight.cloud.points[..., 2][sight.cloud.mask], self.eyes.depth_noise
+        if not len(z) or noise * float(z.median()) ** 2 < self.config.registration.ray_sd:
+            noise = 0.0
         return Observation(
             sight.cloud, potential, nearest_inside(allowed), self.camera, geodesic, None, noise
         )

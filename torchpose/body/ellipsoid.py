@@ -5,7 +5,7 @@ the camera's frame, metres. Every function returns all B x K x N pairs: parts be
 coordinates stand before the points, so that sums over them and products with matrices run along the points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -300,6 +300,45 @@ def _shapes(posed: PosedBody, visible: bool) -> Float[Tensor, "batch parts numbe
 def _camera(posed: PosedBody) -> Float[Tensor, "batch parts 3"]:
     """Where the camera stands in the frame of each ellipsoid, stretched so that this is the unit ball."""
     return -(posed.centers[:, :, None] @ posed.frames)[:, :, 0] / posed.radii
+
+
+def flattened(
+    posed: PosedBody, share: Float[Tensor, "batch parts"]
+) -> tuple[PosedBody, Float[Tensor, "batch parts 3 3"]]:
+    """The body as if each part, with the points about it, were pressed to a `share` of its depth along its ray.
+
+    The nearest point of the flatter ellipsoid is the likeliest one where the noise along rays is larger than across by
+    1 / `share`, and the distance from it counts that noise as the one across. The frames are not rotations: they
+    press points, too, so that `foot_point`, `foot_of_part` and `rough_distance` take the points as they are. Also
+    returned: what takes a point from such a frame to the ellipsoid's own. Both are constants for autograd.
+    """
+    with torch.no_grad():
+        ray = torch.nn.functional.normalize(posed.centers, dim=-1)[..., None]  # (B, K, 3, 1)
+        less = share[..., None, None]
+        unit = posed.frames / posed.radii[..., None, :]
+        unit = unit + (1 / less - 1) * ray * (ray.mT @ unit)
+        square, axes = torch.linalg.eigh(unit @ unit.mT)  # of the form that is 1 on the pressed surface
+        frames = axes - (1 - less) * ray * (ray.mT @ axes)
+        back = posed.frames.mT @ (axes + (1 / less - 1) * ray * (ray.mT @ axes))
+    return replace(posed, frames=frames, radii=square.rsqrt()), back
+
+
+def unflattened(
+    foot: FootPoint,
+    posed: PosedBody,
+    part: Int[Tensor, "batch few num"],
+    points: Float[Tensor, "batch num 3"],
+    back: Float[Tensor, "batch parts 3 3"],
+) -> FootPoint:
+    """Foot points on the parts of a `flattened` body as those of the body itself, each in its ellipsoid's frame."""
+    few = part.shape
+    numbers = torch.cat([back.flatten(2), posed.frames.flatten(2), posed.centers, posed.radii], -1)
+    own = numbers.gather(1, part.flatten(1)[..., None].expand(-1, -1, 24)).view(*few, 24)
+    turn, frames, center, radii = own.split((9, 9, 3, 3), -1)
+    local = (turn.unflatten(-1, (3, 3)) @ foot.local[..., None])[..., 0]
+    place = (frames.unflatten(-1, (3, 3)).mT @ (points[:, None] - center)[..., None])[..., 0]
+    normal = torch.nn.functional.normalize(local / radii**2, dim=-1)
+    return FootPoint(local, normal, place - local, foot.hidden)
 
 
 def algebraic_distance(

@@ -59,8 +59,8 @@ def stack_observations(observations: Sequence[Observation]) -> Observation:
             cell=torch.cat([term.cell for term in terms]),
             distance=torch.cat([term.distance for term in terms]),
         )
-    first = observations[0]
-    return Observation(cloud, potential, nearest, first.camera, geodesic, None, first.depth_noise)
+    noise = max(observation.depth_noise for observation in observations)
+    return Observation(cloud, potential, nearest, observations[0].camera, geodesic, None, noise)
 
 
 def fit_size(

@@ -14,7 +14,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.ellipsoid import FootPoint, algebraic_distance, foot_of_part, foot_point, rough_distance
+from torchpose.body.ellipsoid import (
+    FootPoint,
+    algebraic_distance,
+    flattened,
+    foot_of_part,
+    foot_point,
+    rough_distance,
+    unflattened,
+)
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import Solution, Status
 from torchpose.registration.fitting import (
@@ -269,39 +277,28 @@ class Registrar(nn.Module):
         """The model's points that may answer for each data point, and its distances from all parts."""
         config, points = self.config, observation.cloud.points
         K = self.body.num_parts
+        # Where depths are noisier than `ray_sd`, distances along the ray count for less: the body is taken flatter.
+        seen, back = posed, None
+        if observation.depth_noise > 0:
+            seen, back = flattened(posed, self._trust(posed, observation))
         if not config.hard:
             part = torch.arange(K, device=points.device)[:, None].expand(len(points), K, points.shape[1])
-            foot = foot_point(posed, points, config.visible)
-            return Correspondence(part, foot, self._square(posed, part, foot, observation))
-        # A point's label is one of the nearest parts; those far off need no foot point to be told apart from these.
-        rough = rough_distance(posed, points, config.visible).square()
-        part = rough.detach().topk(min(config.near, K), 1, largest=False).indices
-        foot = foot_of_part(posed, part, points, config.visible)
+            foot = foot_point(seen, points, config.visible)
+            square = foot.residual.square().sum(-1)
+        else:
+            # A point's label is one of the nearest parts; those far off need no foot point to be told apart from these.
+            rough = rough_distance(seen, points, config.visible).square()
+            part = rough.detach().topk(min(config.near, K), 1, largest=False).indices
+            foot = foot_of_part(seen, part, points, config.visible)
+            square = rough.scatter(1, part, foot.residual.square().sum(-1))
         return Correspondence(
-            part, foot, rough.scatter(1, part, self._square(posed, part, foot, observation))
+            part, foot if back is None else unflattened(foot, posed, part, points, back), square
         )
 
-    def _trust(self, observation: Observation) -> Float[Tensor, "batch num"]:
-        """How much a residual along each point's ray counts: less where it is noise more than `ray_sd`."""
-        noise = observation.depth_noise * observation.cloud.points[..., 2].square()
-        return (self.config.ray_sd / noise.clamp_min(self.config.ray_sd)).to(noise)
-
-    def _square(
-        self,
-        posed: PosedBody,
-        part: Int[Tensor, "batch few num"],
-        foot: FootPoint,
-        observation: Observation,
-    ) -> Float[Tensor, "batch few num"]:
-        """Squared distances from foot points, m^2, in which noise along the ray counts as `ray_sd`."""
-        square = foot.residual.square().sum(-1)
-        if observation.depth_noise == 0:
-            return square
-        ray = nn.functional.normalize(observation.cloud.points, dim=-1)  # (B, N, 3)
-        frames = posed.frames.flatten(2).gather(1, part.flatten(1)[..., None].expand(-1, -1, 9))
-        frames = frames.view(*part.shape, 3, 3)
-        along = ((frames.mT @ ray[:, None, :, :, None])[..., 0] * foot.residual).sum(-1)
-        return square - (1 - self._trust(observation).square())[:, None] * along.square()
+    def _trust(self, posed: PosedBody, observation: Observation) -> Float[Tensor, "batch parts"]:
+        """How much a distance along the ray counts at each part: less where it is noise of more than `ray_sd`."""
+        noise = observation.depth_noise * posed.centers[..., 2].square()
+        return self.config.ray_sd / noise.clamp_min(self.config.ray_sd)
 
     def label(
         self, posed: PosedBody, foot: Correspondence, observation: Observation, sigma: float
@@ -379,18 +376,18 @@ class Registrar(nn.Module):
         scale = torch.where(weight > 0, weight.clamp_min(tiny).sqrt(), 0.0) / config.noise_sd
         frames = posed.frames.flatten(2).mT.gather(2, part[:, None].expand(-1, 9, -1)).unflatten(1, (3, 3))
         normal = (frames * normal[:, None]).sum(2)
+        if observation.depth_noise > 0:  # normals of the flatter body
+            trust = self._trust(posed, observation).gather(1, part)[:, None]
+            ray = nn.functional.normalize(posed.centers, dim=-1).mT.gather(2, part[:, None].expand(-1, 3, -1))
+            normal = normal + (1 / trust - 1) * (ray * normal).sum(1, keepdim=True) * ray
+            normal = nn.functional.normalize(normal, dim=1)
         # Along the normal the distance counts in full; along the surface only as far as asked, which lets a limb slide
         # to where it fits. A point behind the rim differs from its foot along the surface too, and counts less there.
         eye = torch.eye(3, dtype=normal.dtype, device=normal.device)[..., None]
         outer = normal[:, :, None] * normal[:, None]
         spread = (1 - config.tangential) * outer + config.tangential * eye  # (B, 3, 3, pairs), symmetric
-        if observation.depth_noise > 0:  # a residual along the ray is noise, mostly
-            ray = nn.functional.normalize(cloud.points, dim=-1).mT.repeat(
-                1, 1, part.shape[1] // cloud.points.shape[1]
-            )
-            along = (ray[:, :, None] * spread).sum(1)  # (B, 3, pairs)
-            less = (1 - self._trust(observation)).repeat(1, part.shape[1] // cloud.points.shape[1])
-            spread = spread - less[:, None, None] * ray[:, :, None] * along[:, None]
+        if observation.depth_noise > 0:
+            spread = spread - ((1 - trust) * ray)[:, :, None] * (ray[:, :, None] * spread).sum(1)[:, None]
         direction = (scale[:, None, None] * spread).flatten(2)
         local, target, direction = (x.mT for x in (local.repeat(1, 1, 3), target.repeat(1, 1, 3), direction))
         return Rows(part.repeat(1, 3), local, target, direction, part.shape[1]), support
