@@ -17,6 +17,8 @@ from torch.testing import assert_close
 from torchpose.body.ellipsoid import (
     FootPoint,
     algebraic_distance,
+    flattened,
+    foot_of_part,
     foot_point,
     nearest_point,
     outline,
@@ -24,8 +26,9 @@ from torchpose.body.ellipsoid import (
     surface_normal,
     to_camera,
     to_local,
+    unflattened,
 )
-from torchpose.body.model import PosedBody, ellipsoid_matrix
+from torchpose.body.model import BodyModel, PosedBody, ellipsoid_matrix
 from torchpose.geometry import exp_rotation
 
 F64 = torch.float64
@@ -586,3 +589,45 @@ class TestRoughDistance:
         error = rough_distance(single, points.float()) - rough_distance(posed, points)
         assert error.abs().max() < 1e-4
         assert_close(rough_distance(repeat(posed, 3), points)[2:], rough_distance(posed, points))
+
+
+def _pressed_by_hand(posed, part, points, share):
+    """Points of a part's surface, and data points, moved along the part's ray: (surface, its moved, data moved)."""
+    generator = torch.Generator().manual_seed(3)
+    ball = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=generator).double(), dim=-1)
+    center, frame, radii = posed.centers[0, part], posed.frames[0, part], posed.radii[0, part]
+    surface = (ball * radii) @ frame.mT + center
+    ray = center / center.norm()
+
+    def press(places):
+        along = ((places - center) @ ray)[:, None] * ray
+        return places - (1 - share) * along
+
+    return surface, press(surface), press(points)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.2])
+def test_a_flattened_body_is_the_body_pressed_along_each_parts_ray(share):
+    """Nearest points by sampling the pressed surface; the foot is where that point was before."""
+    body = BodyModel().double()
+    pose = torch.cat([torch.tensor([[0.3, 0.1, 3.5, 0.4, 0.1, 0.0]]).double(), body.rest[None].double()], 1)
+    posed = body(pose)
+    generator = torch.Generator().manual_seed(0)
+    points = posed.centers[0, [2, 5, 9]] + 0.15 * torch.randn(3, 3, generator=generator).double()
+    flat, back = flattened(posed, torch.full(posed.radii.shape[:2], share, dtype=torch.float64))
+    part = torch.tensor([2, 5, 9])[None, None]
+    foot = foot_of_part(flat, part, points[None], False)
+    whole = unflattened(foot, posed, part, points[None], back)
+    for n, k in enumerate((2, 5, 9)):
+        surface, moved, target = _pressed_by_hand(posed, k, points[n : n + 1], share)
+        gap = (moved - target).norm(dim=1)
+        assert_close(foot.residual[0, 0, n].norm(), gap.min(), atol=2e-3, rtol=0)
+        place = posed.centers[0, k] + posed.frames[0, k] @ whole.local[0, 0, n]
+        assert (place - surface[gap.argmin()]).norm() < 0.02
+        gap = posed.frames[0, k] @ whole.residual[0, 0, n]
+        assert_close(place + gap, points[n], atol=1e-9, rtol=0)
+        assert_close(((whole.local[0, 0, n] / posed.radii[0, k]) ** 2).sum().item(), 1.0, atol=1e-9, rtol=0)
+    if share == 1.0:
+        plain = foot_of_part(posed, part, points[None], False)
+        assert_close(whole.local, plain.local, atol=1e-9, rtol=0)
+        assert_close(whole.normal, plain.normal, atol=1e-9, rtol=0)

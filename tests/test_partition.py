@@ -102,3 +102,29 @@ def test_wrong_settings_are_one_sentence():
         PartitionConfig(jump=0.0)
     with pytest.raises(ValueError, match=r"clear_share must be a share in \[0, 1\], got 2"):
         PartitionConfig(clear_share=2.0)
+
+
+def pieces(*boxes: tuple[int, int, int, int, float]) -> Tensor:
+    """Depth of flat boxes (top, bottom, left, right, m) before nothing."""
+    depth = torch.full((240, 320), torch.nan)
+    for top, bottom, left, right, z in boxes:
+        depth[top:bottom, left:right] = z
+    return depth
+
+
+def test_a_newcomer_whose_arm_parts_trunk_and_legs_is_one_person():
+    """The trunk, and the legs a quarter of a metre behind it, 90 cm of each; beside them another person."""
+    trunk, legs, other = (40, 110, 20, 60, 3.5), (110, 190, 25, 58, 3.78), (50, 190, 220, 260, 3.5)
+    depth = pieces(trunk, legs, other)
+    masks = split_people(depth > 0, depth, CAMERA, None)
+    assert len(masks) == 2
+    assert {bool(mask[60, 40]) for mask in masks} == {True, False}
+    for mask in masks:
+        assert bool(mask[60, 40]) == bool(mask[150, 40]) != bool(mask[100, 240])
+
+
+def test_one_behind_the_other_are_two_newcomers():
+    depth = pieces((40, 190, 100, 140, 3.2), (40, 190, 140, 175, 4.2))
+    masks = split_people(depth > 0, depth, CAMERA, None)
+    assert len(masks) == 2
+    assert not (masks[0] & masks[1]).any()

@@ -1,5 +1,6 @@
 """Cold starts: bodies that are seen exactly are found from nothing, and what the search tries."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -165,9 +166,9 @@ def test_a_pose_turned_away_must_fit_better(body, starter):
     both = torch.cat([standing(body), standing(body, yaw=torch.pi)])
     found = Registrar(body, RegistrationConfig(rounds=1))(view.observation(), both, body.default_size(1))
     even = replace(found, pose=both, score=torch.tensor([20.0, 20.0]), misfit=torch.tensor([0.01, 0.5]))
-    score = starter._score(even)
+    score = starter.score(even)
     assert_close(score, torch.tensor([20.0, 20.0 + starter.config.back_penalty]))
-    assert starter._score(replace(even, score=torch.tensor([torch.nan, 20.0]))).argmin() == 1
+    assert starter.score(replace(even, score=torch.tensor([torch.nan, 20.0]))).argmin() == 1
 
 
 def test_a_registration_gives_one_of_its_rows(body):
@@ -185,9 +186,29 @@ def test_a_registration_gives_one_of_its_rows(body):
     [
         ({"points": 0}, "points must be at least 1, got 0"),
         ({"finalists": 0}, "finalists must be at least 1, got 0"),
-        ({"yaws": ()}, "yaws and face_yaws need at least one angle each"),
+        ({"yaws": ()}, "yaws, face_yaws and walking_yaws need at least one angle each"),
     ],
 )
 def test_bad_settings_are_told(setting, message):
     with pytest.raises(ValueError, match=message):
         StartConfig(**setting)
+
+
+def test_somebody_walking_starts_the_way_he_goes(body, starter):
+    view = see(body, standing(body, yaw=1.2), num=100)
+    starts = starter.hypotheses(view.observation(), view.no_face(), body.default_size(1), walking=1.2)
+    off = torch.remainder(starts[:, 3] - 1.2 + torch.pi, 2 * torch.pi) - torch.pi
+    assert {round(math.degrees(float(yaw))) for yaw in off} <= {-35, 0, 35, 180, -180}
+    assert (off.abs() < 0.1).sum() > 4
+
+
+def test_going_backwards_must_fit_better(body, starter):
+    """By the cosine: nothing for the way somebody walks, all of the penalty for the other."""
+    pose = standing(body).repeat(3, 1)
+    pose[:, 3] = torch.tensor([0.5, 0.5 + torch.pi / 2, 0.5 + torch.pi])
+    view = see(body, standing(body), num=60)
+    found = starter.registrar(view.observation(), standing(body).repeat(3, 1), body.default_size(1))
+    found = replace(found, pose=pose)
+    costs = starter.score(found, walking=0.5) - starter.score(found)
+    penalty = starter.config.backwards_penalty
+    assert_close(costs, torch.tensor([0.0, penalty / 2, penalty]), atol=1e-4, rtol=0)

@@ -66,11 +66,11 @@ class ScriptedStarter(Starter):
         self.pose, self.misfit, self.refreshed, self.status = None, GOOD, None, Status.CONVERGED
         self.calls, self.prior = [], None
 
-    def forward(self, observation, faces, size):
+    def forward(self, observation, faces, size, walking=None):
         self.calls.append("cold")
         return registration(self.pose, self.misfit, status=self.status)
 
-    def refresh(self, observation, pose, size, prior=None):
+    def refresh(self, observation, pose, size, prior=None, walking=None):
         self.calls.append("refresh")
         self.prior = prior
         return registration(pose, BAD) if self.refreshed is None else self.refreshed
@@ -376,3 +376,28 @@ def test_an_identical_frame_has_the_identical_pose(body):
 def test_bad_settings_are_told(setting, message):
     with pytest.raises(ValueError, match=message.replace(".", r"\.")):
         replace(CONFIG, **setting)
+
+
+def test_whoever_walks_backwards_is_doubted_and_turned_if_that_fits(body, scripted, view):
+    """Tried once in `retry` seconds; taken where the score with the penalty says so; a face that is seen decides."""
+    tracker, registrar, starter = scripted
+    observation, faces, size = view.observation(), view.no_face(), body.default_size(1)
+    back, ahead = standing(body, yaw=3.0), standing(body, yaw=-0.1)
+    tracker.begin(back, 0.0)
+    starter.pose, registrar.pose = ahead, back
+    answer = tracker(0.05, observation, faces, size, walking=-0.1)
+    assert answer.status is TrackStatus.recovered
+    assert_close(answer.registration.pose, ahead)
+
+    tracker.forget()
+    tracker.begin(back, 0.0)
+    starter.misfit = 0.05  # 40 nats worse, more than going backwards costs
+    answers = [tracker(t, observation, faces, size, walking=-0.1) for t in (0.05, 0.1, 0.15)]
+    assert all(answer.status is TrackStatus.tracked for answer in answers)
+    assert starter.calls.count("cold") == 2  # one for each part of this test
+
+    tracker.forget()
+    tracker.begin(back, 0.0)
+    starter.misfit = GOOD
+    tracker(0.05, observation, faces, size, walking=2.8)
+    assert starter.calls.count("cold") == 2

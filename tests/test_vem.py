@@ -16,6 +16,7 @@ from torchpose.registration.fitting import FittingConfig, JacobianKind, PosePrio
 from torchpose.registration.geodesic import geodesic_bounds, geodesic_term
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.silhouette import RimConfig
+from torchpose.registration.size import stack_observations
 from torchpose.registration.vem import (
     Distance,
     Observation,
@@ -548,3 +549,52 @@ def test_revolute_joints_register_too():
     pose = standing(body)
     found = Registrar(body)(see(body, pose).observation(), off(pose, 4, 0), body.default_size(1))
     assert joint_errors(body, found.pose, pose).mean() < 0.03
+
+
+def _noisy(body, pose, sd, seed):
+    """A view whose depths are off by `sd` at 4.4 m, and what registration sees of it with and without knowing."""
+    view = see(body, pose, num=400, noise=sd, generator=torch.Generator().manual_seed(seed))
+    plain = view.observation()
+    return plain, replace(plain, depth_noise=sd / 4.4**2)
+
+
+def test_noise_along_rays_is_not_taken_for_shape():
+    """Twelve centimetres, as of a matcher at 4.4 m: who knows of it is nearer to the truth, and fewer points stray."""
+    body = BodyModel()
+    better, strays = [], []
+    for seed in range(4):
+        pose = standing(body, yaw=0.6 * seed - 0.9, z=4.4)
+        plain, knowing = _noisy(body, pose, 0.12, seed)
+        registrar, size = Registrar(body), body.default_size(1)
+        start = pose + 0.15 * torch.randn(pose.shape, generator=torch.Generator().manual_seed(seed))
+        true = body(pose, size).joints
+        error, stray = [], []
+        for observation in (plain, knowing):
+            found = registrar(observation, start, size, None, 12)
+            error.append(float((body(found.pose, size).joints - true).norm(dim=-1).mean()))
+            stray.append(float(found.belief[0, -1].sum() / observation.cloud.mask.sum()))
+        better.append(error[1] / error[0])
+        strays.append(stray[1] - stray[0])
+    assert sum(better) / len(better) < 0.85
+    assert max(strays) < 0
+
+
+def test_noise_below_the_settings_own_changes_nothing(scene):
+    body = BodyModel()
+    pose = standing(body)
+    observation = see(body, pose).observation()
+    registrar, size = Registrar(body), body.default_size(1)
+    quiet = replace(observation, depth_noise=0.5 * registrar.config.ray_sd / 3.6**2)
+    assert_close(registrar(quiet, pose, size).pose, registrar(observation, pose, size).pose, atol=1e-4, rtol=0)
+
+
+def test_a_noisy_batch_equals_one_by_one():
+    body = BodyModel()
+    poses = [standing(body, yaw=yaw, z=z) for yaw, z in ((0.0, 3.9), (0.7, 4.6))]
+    each = [_noisy(body, pose, 0.08, k)[1] for k, pose in enumerate(poses)]
+    registrar, size = Registrar(body), body.default_size(1)
+    both = registrar(stack_observations(each), torch.cat(poses), size)
+    for k, (observation, pose) in enumerate(zip(each, poses, strict=True)):
+        alone = registrar(observation, pose, size)
+        assert_close(both.pose[k : k + 1], alone.pose, atol=1e-4, rtol=0)
+        assert_close(both.misfit[k : k + 1], alone.misfit, atol=1e-4, rtol=0)

@@ -67,6 +67,9 @@ class PeopleConfig:
         2.0  # up to which a newcomer is somebody known: 1 for clothes at the limit above, 1 for a
     )
     # place two standard deviations off
+    appearing: float = (
+        3.0  # times that, for whoever does not come in at the image's border, and was just there
+    )
     scraps: float = 0.2  # of a newcomer's pixels; who has fewer may be the newcomer
     walking_speed: float = 0.5  # m/s, from which somebody faces the way he or she goes
     arrival: int = 3  # frames in which somebody further must be seen, before a pose is sought
@@ -331,9 +334,11 @@ class People:
         v, u = (mask & (view.depth[0] > 0)).nonzero(as_tuple=True)
         points = self.model.camera.back_project(torch.stack([u, v], -1).to(view.depth), view.depth[0, v, u])
         middle = points.median(0).values
-        best, least = None, self.config.strangeness
+        # Who does not come in at the image's border was there before, behind something or lost.
+        inside = not _at_border(mask)
+        best, least = None, math.inf
         for k, follower in enumerate(self.followers):
-            strange = 0.0
+            strange, limit = 0.0, self.config.strangeness
             if clothes is not None and follower.clothes is not None:
                 alike = float(colour_similarity(follower.clothes, clothes)[0])
                 strange += (1 - alike) / (1 - self.config.same_clothes)
@@ -344,9 +349,10 @@ class People:
                     return k  # two people are not at one place: this is more of the same
                 variance = body.covariance[0].diagonal()[[0, 2]] + self.config.middle_sd**2
                 strange += float((off / variance).sum()) / 4
+                limit *= self.config.appearing if inside else 1.0
             elif k not in free or clothes is None or follower.clothes is None:
                 continue
-            if strange < least:
+            if strange < min(limit, least):
                 best, least = k, strange
         return best
 
@@ -535,6 +541,11 @@ class PeopleWindows:
     def flush(self) -> list[list[FramePose]]:
         """The frames that are left at the end of the recording."""
         return _by_frame([window.flush() for window in self.windows])
+
+
+def _at_border(mask: Bool[Tensor, "height width"]) -> bool:
+    """Whether somebody is cut by the image's sides, where people come in."""
+    return bool(mask[:, :2].any() | mask[:, -2:].any())
 
 
 def _spread(place: Gaussian) -> Float[Tensor, " batch"]:

@@ -376,16 +376,20 @@ class Registrar(nn.Module):
         scale = torch.where(weight > 0, weight.clamp_min(tiny).sqrt(), 0.0) / config.noise_sd
         frames = posed.frames.flatten(2).mT.gather(2, part[:, None].expand(-1, 9, -1)).unflatten(1, (3, 3))
         normal = (frames * normal[:, None]).sum(2)
-        if observation.depth_noise > 0:  # normals of the flatter body
+        slack: float | Tensor = 1 - config.tangential
+        if (
+            observation.depth_noise > 0
+        ):  # normals of the flatter body, which say little of where a limb may slide
             trust = self._trust(posed, observation).gather(1, part)[:, None]
             ray = nn.functional.normalize(posed.centers, dim=-1).mT.gather(2, part[:, None].expand(-1, 3, -1))
             normal = normal + (1 / trust - 1) * (ray * normal).sum(1, keepdim=True) * ray
             normal = nn.functional.normalize(normal, dim=1)
+            slack = (slack * trust)[:, None]
         # Along the normal the distance counts in full; along the surface only as far as asked, which lets a limb slide
         # to where it fits. A point behind the rim differs from its foot along the surface too, and counts less there.
         eye = torch.eye(3, dtype=normal.dtype, device=normal.device)[..., None]
         outer = normal[:, :, None] * normal[:, None]
-        spread = (1 - config.tangential) * outer + config.tangential * eye  # (B, 3, 3, pairs), symmetric
+        spread = slack * outer + (1 - slack) * eye  # (B, 3, 3, pairs), symmetric
         if observation.depth_noise > 0:
             spread = spread - ((1 - trust) * ray)[:, :, None] * (ray[:, :, None] * spread).sum(1)[:, None]
         direction = (scale[:, None, None] * spread).flatten(2)
