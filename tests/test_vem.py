@@ -561,22 +561,18 @@ def _noisy(body, pose, sd, seed):
 def test_noise_along_rays_is_not_taken_for_shape():
     """Twelve centimetres, as of a matcher at 4.4 m: who knows of it is nearer to the truth, and fewer points stray."""
     body = BodyModel()
-    better, strays = [], []
-    for seed in range(4):
-        pose = standing(body, yaw=0.6 * seed - 0.9, z=4.4)
-        plain, knowing = _noisy(body, pose, 0.12, seed)
+    errors, strays = [], []
+    for seed in range(6):
+        pose = standing(body, yaw=0.3 * seed - 0.9, z=4.4)
         registrar, size = Registrar(body), body.default_size(1)
-        start = pose + 0.15 * torch.randn(pose.shape, generator=torch.Generator().manual_seed(seed))
+        start = pose + 0.08 * torch.randn(pose.shape, generator=torch.Generator().manual_seed(seed))
         true = body(pose, size).joints
-        error, stray = [], []
-        for observation in (plain, knowing):
+        for observation in _noisy(body, pose, 0.12, seed):
             found = registrar(observation, start, size, None, 12)
-            error.append(float((body(found.pose, size).joints - true).norm(dim=-1).mean()))
-            stray.append(float(found.belief[0, -1].sum() / observation.cloud.mask.sum()))
-        better.append(error[1] / error[0])
-        strays.append(stray[1] - stray[0])
-    assert sum(better) / len(better) < 0.85
-    assert max(strays) < 0
+            errors.append(float((body(found.pose, size).joints - true).norm(dim=-1).mean()))
+            strays.append(float(found.belief[0, -1].sum() / observation.cloud.mask.sum()))
+    assert sum(errors[1::2]) < 0.9 * sum(errors[::2])
+    assert all(knowing < plain for plain, knowing in zip(strays[::2], strays[1::2], strict=True))
 
 
 def test_noise_below_the_settings_own_changes_nothing(scene):
