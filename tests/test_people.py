@@ -1,50 +1,81 @@
-"""The benchmark on recordings with true joints: its oracles are what they say, and its figures are in range."""
+"""What is known of people beside their poses: the way they walk, how tall they are, where they come in."""
 
-from pathlib import Path
+import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from benchmarks.people import ABLATIONS, LIMB_JOINTS, Truth, measure, true_pose, true_size
-from torchpose.body.angle import limb_angles
 from torchpose.body.model import BodyModel
-from torchpose.cli import load_config
+from torchpose.people import People, PeopleConfig, _at_border
+from torchpose.pipeline import RIM, StereoToPose
+from torchpose.tracking.location import sighting
+from torchpose.vision.camera import StereoCamera
+
+CAMERA = StereoCamera(160, 120, 150.0, 80.0, 60.0, 0.12, 10.0)
 
 
-@pytest.fixture
-def recording(shared_data: Path) -> Path:
-    folder = shared_data / "people" / "knee_lifts_m2"
-    if not folder.is_dir():
-        pytest.skip(f"no folder {folder}")
-    return folder
+@pytest.fixture(scope="module")
+def people():
+    return People(StereoToPose(CAMERA))
 
 
-def test_the_start_and_size_oracles_put_the_body_on_the_true_joints(recording: Path):
-    truth, body = Truth(recording), BodyModel()
-    for index in (0, 20, 40):
-        posed = body(true_pose(body, truth, index), true_size(body, truth))
-        true = truth.joints[index]
-        # Limbs point the same way, so their angles agree; both hips hang on one straight pelvis in our body.
-        same = limb_angles(torch.cat([torch.zeros(3, 3), true]))
-        torch.testing.assert_close(limb_angles(posed.joints[0])[:6], same[:6], atol=0.05, rtol=0)
-        assert (posed.joints[0, 3:] - true).norm(dim=-1).max() < 0.08
-    assert len(LIMB_JOINTS) == truth.joints.shape[1] == 12
+def walk(people, velocity, seconds=1.0, rate=10.0):
+    """A first person who goes at a constant velocity (x, z), m/s, for some time."""
+    follower = people.followers[0]
+    follower.trail, places = follower.trail[:0], []
+    for n in range(int(seconds * rate) + 1):
+        t = n / rate
+        places.append([t, velocity[0] * t, 3.0 + velocity[1] * t])
+    follower.trail = follower.trail.new_tensor(places)
+    trunk = torch.tensor([[velocity[0] * seconds, 0.0, 3.0 + velocity[1] * seconds]])
+    follower.location = people.filter.begin(sighting(body=trunk), seconds).location
+    return people._walking(follower, seconds)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "oracles", [(), ("disparity", "mask", "labels", "start", "size")], ids=["ours", "truth"]
-)
-def test_a_real_recording_is_measured_within_the_first_issue_s_targets(
-    recording: Path, oracles: tuple[str, ...]
-):
-    figures = measure(recording, load_config("infer"), oracles, frames=10)
-    assert figures["angle_deg"] < 12
-    assert figures["joint_mm"] < 100
-    assert figures["unanswered"] == 0
+@pytest.mark.parametrize("velocity", [(1.0, 0.0), (-1.2, 0.0), (0.0, -0.8), (0.5, 0.6)])
+def test_whoever_walks_faces_the_way_he_goes(people, velocity):
+    """A person whose pose has this yaw looks along the velocity: the front is -z of a body that does not turn."""
+    yaw = walk(people, velocity)
+    body = BodyModel()
+    pose = torch.cat([torch.tensor([[0.0, 0.0, 3.0, yaw, 0.0, 0.0]]), body.rest[None]], 1)
+    across = body(pose).joints[0]
+    left, right = (across[body.joint_names.index(f"shoulder_{side}")] for side in ("left", "right"))
+    # The left shoulder is on the left of the way: turning the way by a quarter to its left, seen from above.
+    way = torch.tensor([velocity[0], 0.0, velocity[1]])
+    leftward = torch.tensor([-velocity[1], 0.0, velocity[0]])
+    aside = (left - right) / (left - right).norm()
+    assert_close(float(aside @ leftward / leftward.norm()), 1.0, atol=0.02, rtol=0)
+    assert abs(float(aside @ way)) < 0.1
 
 
-def test_every_ablation_is_a_setting_of_its_own():
-    configs = [load_config("infer", settings).pose for settings in ABLATIONS.values()]
-    assert configs[0] == load_config("infer").pose
-    assert all(first != other for i, first in enumerate(configs) for other in configs[:i])
+def test_whoever_stands_or_just_came_faces_no_way(people):
+    assert walk(people, (0.3, 0.0)) is None
+    assert walk(people, (1.0, 0.0), seconds=0.3) is None
+    follower = people.followers[0]
+    assert walk(people, (1.0, 0.0)) is not None
+    assert people._walking(follower, 1.0 + 2 * people.config.memory) is None
+
+
+def test_the_height_is_the_second_tallest_of_upright_sights(people):
+    model = people.model
+    H = model.body.height
+    assert model.height_of([]) == H
+    assert model.height_of([0.6 * H, 0.8 * H]) == H  # sitting
+    assert_close(model.height_of([1.60, 0.7 * H]), 1.60 + RIM)
+    assert_close(model.height_of([1.60, 1.62, 1.95]), 1.62 + RIM)
+    assert model.height_of([3.0, 3.0]) == 1.2 * H
+
+
+def test_the_sides_of_the_image_are_where_people_come_in():
+    mask = torch.zeros(20, 30, dtype=torch.bool)
+    mask[5:20, 10:15] = True
+    assert not _at_border(mask)  # cut below: near the camera
+    mask[6, 29] = True
+    assert _at_border(mask)
+
+
+def test_wrong_settings_are_told():
+    with pytest.raises(ValueError, match="walking_speed must be positive"):
+        PeopleConfig(walking_speed=0.0)
+    assert math.isfinite(PeopleConfig().appearing)

@@ -581,7 +581,9 @@ def test_noise_below_the_settings_own_changes_nothing(scene):
     observation = see(body, pose).observation()
     registrar, size = Registrar(body), body.default_size(1)
     quiet = replace(observation, depth_noise=0.5 * registrar.config.ray_sd / 3.6**2)
-    assert_close(registrar(quiet, pose, size).pose, registrar(observation, pose, size).pose, atol=1e-4, rtol=0)
+    assert_close(
+        registrar(quiet, pose, size).pose, registrar(observation, pose, size).pose, atol=1e-4, rtol=0
+    )
 
 
 def test_a_noisy_batch_equals_one_by_one():
