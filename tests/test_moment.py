@@ -77,6 +77,26 @@ def test_the_equations_are_those_of_the_rows_at_any_pose(kind):
     assert_close(whole[:, :-1, :-1], reference.mT @ reference, atol=1e-9 * float(whole.abs().max()), rtol=0)
 
 
+@each_kind
+def test_a_shift_of_a_parts_points_drives_the_pose_as_autograd_says(kind):
+    """J^T N against autograd's J and N, N by moving the points of each part in the part's own frame."""
+    body, truth, size, rows = scene(kind)
+    pose = truth + 0.3 * torch.randn_like(truth)
+    equations = MomentEquations(sums_of(rows, body(truth - 0.3, size)), body.part_moves)
+    found = equations.by_offset(body(pose, size))
+    assert found.shape == (2, body.num_parameters, 3 * body.num_parts)
+    for b in range(2):
+        one = row(rows, b)
+
+        def residual(x, shift, one=one):
+            moved = replace(one, local=one.local + shift.view(-1, 3)[one.part])
+            return residual_of(moved, body(x[None], size))[0]
+
+        nothing = torch.zeros(3 * body.num_parts, dtype=torch.float64)
+        J, N = torch.func.jacrev(residual, (0, 1))(pose[b], nothing)
+        assert_close(found[b], J.mT @ N, atol=1e-9 * float(found.abs().max()), rtol=0)
+
+
 def row(rows, b):
     return Rows(*(getattr(rows, name)[b : b + 1] for name in ROW_FIELDS))
 
@@ -182,4 +202,6 @@ def test_no_rows_say_nothing():
     body, truth, size, rows = scene()
     none = Rows(*(getattr(rows, name)[:, :0] for name in ROW_FIELDS))
     posed = body(truth, size)
-    assert (MomentEquations(sums_of(none, posed), body.part_moves)(posed) == 0).all()
+    equations = MomentEquations(sums_of(none, posed), body.part_moves)
+    assert (equations(posed) == 0).all()
+    assert (equations.by_offset(posed) == 0).all()
