@@ -289,9 +289,14 @@ class Registrar(nn.Module):
         labelling: Labelling,
         observation: Observation,
         rim: bool = True,
+        tangential: float | None = None,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
-        rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud)
+        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part.
+
+        `tangential` overrides the config.
+        """
+        tangential = self.config.tangential if tangential is None else tangential
+        rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud, tangential)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(
                 posed, observation.nearest, observation.camera, self.config.rim, observation.frame
@@ -309,6 +314,7 @@ class Registrar(nn.Module):
         foot: Correspondence,
         belief: Float[Tensor, "batch labels num"],
         cloud: PointCloud,
+        tangential: float,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
         """Three rows for each pair of point and part, all first coordinates first; and the points on each part.
 
@@ -345,7 +351,7 @@ class Registrar(nn.Module):
         # to where it fits. A point behind the rim differs from its foot along the surface too, and counts less there.
         eye = torch.eye(3, dtype=normal.dtype, device=normal.device)[..., None]
         outer = normal[:, :, None] * normal[:, None]
-        spread = (1 - config.tangential) * outer + config.tangential * eye  # (B, 3, 3, pairs), symmetric
+        spread = (1 - tangential) * outer + tangential * eye  # (B, 3, 3, pairs), symmetric
         direction = (scale[:, None, None] * spread).flatten(2)
         local, target, direction = (x.mT for x in (local.repeat(1, 1, 3), target.repeat(1, 1, 3), direction))
         return Rows(part.repeat(1, 3), local, target, direction, part.shape[1]), support

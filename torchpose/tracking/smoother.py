@@ -163,9 +163,11 @@ class Smoother(nn.Module):
             pose, between = self.hypotheses(observation, pose, size, chain.pull, self._rest_share(time_s))
         for _ in range(self.config.rounds):
             equations = self._equations(observation, pose, size, time_s)
-            pose, covariance, filtered = fit_chain(equations, pose, chain, self.config.steps)
+            pose, _, filtered = fit_chain(equations, pose, chain, self.config.steps)
         if self.config.rounds:
-            between = between + self._misled(equations, pose, size, chain)
+            # A point's foot slides over the surface: it says where the surface is, nothing along it.
+            equations = self._equations(observation, pose, size, time_s, tangential=0.0)
+            covariance = self._covariance(equations, pose, size, chain)
         nothing = PosePrior(pose, torch.zeros_like(pose))
         status = torch.where(is_finite(tracked), best.status, int(Status.NON_FINITE))
         result = self.registrar.evaluate(observation, pose, size, nothing, best.bound, status)
@@ -225,7 +227,12 @@ class Smoother(nn.Module):
         return now
 
     def _equations(
-        self, observation: Observation, pose: Tensor, size: Tensor, time_s: Tensor
+        self,
+        observation: Observation,
+        pose: Tensor,
+        size: Tensor,
+        time_s: Tensor,
+        tangential: float | None = None,
     ) -> PoseEquations:
         """Of each frame alone, with the labels that its points have at this pose."""
         registrar = self.registrar
@@ -233,23 +240,19 @@ class Smoother(nn.Module):
         foot = registrar.correspond(posed, observation)
         observation = unoccluded(observation, posed, self.config.hypotheses.occlusion)
         labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
-        rows, support = registrar.rows(posed, foot, labelling, observation)
+        rows, support = registrar.rows(posed, foot, labelling, observation, tangential=tangential)
         rest = registrar.with_rest(PosePrior(pose, torch.zeros_like(pose)), support)
         rest = PosePrior(rest.mean, rest.precision * self._rest_share(time_s))
         return equations_by_moments(self.body, size, rows, rest, registrar.config.fitting, posed)
 
-    def _misled(
-        self,
-        equations: PoseEquations,
-        pose: Float[Tensor, "frames parameters"],
-        size: Tensor,
-        chain: Chain,
+    def _covariance(
+        self, equations: PoseEquations, pose: Float[Tensor, "frames parameters"], size: Tensor, chain: Chain
     ) -> Float[Tensor, "frames parameters parameters"]:
-        """Covariance of the poses from what all points of a part have in common, in all frames.
+        """Of the poses given all frames: from each point's own errors, and from those of a part's points together.
 
         A part's surface is not quite the person's, and labels end elsewhere than its points do: its points are off by
-        one shift, normal with `offset_sd` across the part and `slide_sd` along it. The poses follow it as the chain's
-        equations say: where a limb shows over all its length it hardly turns, where only its top shows it does.
+        one shift in all frames, normal with `offset_sd` across the part and `slide_sd` along it. The poses follow it as
+        the chain's equations say: a limb that shows in full hardly turns, one of which only the top shows does.
         """
         posed = self.body(pose, size)
         _, _, normal = equations.at(pose, posed)
@@ -257,10 +260,10 @@ class Smoother(nn.Module):
         sound = (normal.isfinite() & pushed.isfinite().all(2, keepdim=True)).all((1, 2), keepdim=True)
         floor = torch.full_like(pose, FLOOR).diag_embed()
         blocks = torch.where(sound, normal, 0.0) + chain.blocks() + floor
-        followed, _, _ = solve_chain(blocks, -chain.pull, torch.where(sound, pushed, 0.0))
+        followed, own, _ = solve_chain(blocks, -chain.pull, torch.where(sound, pushed, 0.0))
         across, along = self.config.offset_sd, self.config.slide_sd  # a part's long axis is its last
         followed = followed * pose.new_tensor([across, across, along]).repeat(self.body.num_parts)
-        return followed @ followed.mT
+        return own + followed @ followed.mT
 
     def _rest_share(self, time_s: Tensor) -> float:
         """Frame after frame an unseen limb would be drawn to rest anew: one pull in `rest_time` is meant."""
