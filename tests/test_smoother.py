@@ -190,7 +190,7 @@ def test_what_a_parts_points_have_in_common_misleads_all_frames_as_fits_to_shift
             moved = replace(rows, local=rows.local + shift[rows.part])
             way = (fit_chain(equations_of(moved), before, chain, 8)[0] - before) * sd / tiny
             expected = expected + way[:, :, None] * way[:, None]
-    smoother = Smoother(body, Registrar(body), SmoothingConfig(offset_sd=sds[0], slide_sd=sds[1]))
+    smoother = Smoother(body, Registrar(body), SmoothingConfig(offset_sd=sds[0], slide_sd=sds[1], piece=1.0))
     found = smoother._covariance(equations_of(rows), before, size, chain)
     assert_close(found, expected, rtol=1e-3, atol=1e-6)
 
@@ -208,7 +208,7 @@ def test_a_limb_of_which_only_the_top_shows_turns_by_more_than_one_that_shows_in
         each = []
         for offset in (0.0, 0.03):
             config = SmoothingConfig(
-                offset_sd=offset, slide_sd=0.0, sweeps=0, hypotheses=HypothesisConfig(sweeps=0)
+                offset_sd=offset, slide_sd=0.0, piece=1.0, sweeps=0, hypotheses=HypothesisConfig(sweeps=0)
             )
             smooth = Smoother(body, registrar, config)(seen, times(2), found, body.default_size(1))
             each.append(smooth.registration.covariance[0].diagonal())
@@ -596,6 +596,7 @@ def test_taken_rows_are_the_frames_one_by_one_and_put_back(scene):
         ({"ahead": -1}, "0 <= ahead < stretch must hold, in frames, got -1 and 50"),
         ({"joint_drift": 0.0}, "joint_drift must be positive, got 0.0"),
         ({"rest_time": math.nan}, "rest_time must be positive, got nan"),
+        ({"piece": 0.5}, "piece must be at least 1, got 0.5"),
         ({"offset_sd": -0.01}, "offset_sd must not be negative, got -0.01; 0 switches it off"),
         ({"slide_sd": -0.02}, "slide_sd must not be negative, got -0.02; 0 switches it off"),
     ],

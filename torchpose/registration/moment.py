@@ -108,6 +108,18 @@ class MomentEquations:
         own = (self.moments.matrix @ frames).mT  # (B, K, 3, 13): each part's rows hear of its own shift alone
         return (own @ self._columns(posed)[..., :-1]).flatten(1, 2).mT
 
+    def extent(self, posed: PosedBody) -> Float[Tensor, "batch parts"]:
+        """How far the rows of each part are spread along it: their variance to that of an even spread over its length.
+
+        The weights are the directions' squares; a part without rows has 0.
+        """
+        z, one = [2, 6, 10], SHIFT  # the entries n h_2 and n of a: their products, added over n
+        matrix = self.moments.matrix
+        square, first, weight = (matrix[..., i, j].sum(-1) for i, j in ((z, z), (z, one), (one, one)))
+        weight = torch.where(weight > 0, weight, 1.0)
+        variance = (square / weight - (first / weight).square()).clamp_min(0)
+        return 3 * variance / posed.radii[..., 2].square()
+
     def _columns(self, posed: PosedBody) -> Float[Tensor, "batch parts 13 parameters_1"]:
         """What the derivatives by the parameters, and the residual, take of each part's a."""
         moments = self.moments

@@ -38,8 +38,9 @@ class SmoothingConfig:
     rest_time: float = 2.0  # s after which an unseen limb forgets where it was
     # Of what all points of a part have in common, in all frames: m by which they may be off across it and along it, as
     # surface, joints and borders are not quite the person's. It says how sure the poses are and does not move them.
-    offset_sd: float = 0.02
-    slide_sd: float = 0.05
+    offset_sd: float = 0.01
+    slide_sd: float = 0.02
+    piece: float = 3.0  # times as much for a piece of a part as for all of it
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
 
     def __post_init__(self) -> None:
@@ -55,6 +56,10 @@ class SmoothingConfig:
         for name in ("offset_sd", "slide_sd"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
+        if not self.piece >= 1:
+            raise ValueError(
+                f"piece must be at least 1, got {self.piece}; 1 takes pieces of parts for whole ones"
+            )
 
 
 @dataclass(frozen=True)
@@ -260,9 +265,13 @@ class Smoother(nn.Module):
         sound = (normal.isfinite() & pushed.isfinite().all(2, keepdim=True)).all((1, 2), keepdim=True)
         floor = torch.full_like(pose, FLOOR).diag_embed()
         blocks = torch.where(sound, normal, 0.0) + chain.blocks() + floor
-        followed, own, _ = solve_chain(blocks, -chain.pull, torch.where(sound, pushed, 0.0))
-        across, along = self.config.offset_sd, self.config.slide_sd  # a part's long axis is its last
-        followed = followed * pose.new_tensor([across, across, along]).repeat(self.body.num_parts)
+        # A part's long axis is its last. What a whole part's points have in common the sizes have taken up; where only
+        # a piece of it shows, its points may be off by more.
+        across, along = self.config.offset_sd, self.config.slide_sd
+        more = 1 + (self.config.piece - 1) * (1 - equations.of_rows.extent(posed).clamp_max(1))
+        sd = more[..., None] * pose.new_tensor([across, across, along])
+        pushed = torch.where(sound, pushed * sd.flatten(1)[:, None], 0.0)
+        followed, own, _ = solve_chain(blocks, -chain.pull, pushed)
         return own + followed @ followed.mT
 
     def _rest_share(self, time_s: Tensor) -> float:
