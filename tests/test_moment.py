@@ -77,6 +77,43 @@ def test_the_equations_are_those_of_the_rows_at_any_pose(kind):
     assert_close(whole[:, :-1, :-1], reference.mT @ reference, atol=1e-9 * float(whole.abs().max()), rtol=0)
 
 
+@each_kind
+def test_a_shift_of_a_parts_points_drives_the_pose_as_autograd_says(kind):
+    """J^T N against autograd's J and N, N by moving the points of each part in the part's own frame."""
+    body, truth, size, rows = scene(kind)
+    pose = truth + 0.3 * torch.randn_like(truth)
+    equations = MomentEquations(sums_of(rows, body(truth - 0.3, size)), body.part_moves)
+    found = equations.by_offset(body(pose, size))
+    assert found.shape == (2, body.num_parameters, 3 * body.num_parts)
+    for b in range(2):
+        one = row(rows, b)
+
+        def residual(x, shift, one=one):
+            moved = replace(one, local=one.local + shift.view(-1, 3)[one.part])
+            return residual_of(moved, body(x[None], size))[0]
+
+        nothing = torch.zeros(3 * body.num_parts, dtype=torch.float64)
+        J, N = torch.func.jacrev(residual, (0, 1))(pose[b], nothing)
+        assert_close(found[b], J.mT @ N, atol=1e-9 * float(found.abs().max()), rtol=0)
+
+
+def test_the_extent_of_rows_is_1_of_an_even_spread_and_less_of_a_piece():
+    """From -1 to 1 the variance is 1/3; of a piece a quarter as long it is a sixteenth of that, wherever it lies."""
+    body = body_of()
+    pose, size = random_pose(body, 1), random_size(body)
+    posed = body(pose, size)
+    along = torch.linspace(-1, 1, 2001, dtype=torch.float64)
+    places = torch.stack([along, along / 4, along / 4 - 0.7])
+    local = torch.zeros(3, 2001, 3, dtype=torch.float64)
+    local[..., 2] = places * posed.radii[0, [2, 6, 9], 2:]
+    part = torch.tensor([2, 6, 9]).repeat_interleave(2001)[None]
+    direction = 30 * torch.nn.functional.normalize(torch.randn(1, 6003, 3, dtype=torch.float64), dim=-1)
+    rows = Rows(part, local.view(1, -1, 3), torch.zeros(1, 6003, 3, dtype=torch.float64), direction)
+    extent = MomentEquations(sums_of(rows, posed), body.part_moves).extent(posed)[0]
+    assert_close(extent[[2, 6, 9]], torch.tensor([1, 1 / 16, 1 / 16], dtype=torch.float64), rtol=3e-3, atol=0)
+    assert (extent[[0, 1, 3, 4, 5, 7, 8, 10, 11, 12, 13]] == 0).all()
+
+
 def row(rows, b):
     return Rows(*(getattr(rows, name)[b : b + 1] for name in ROW_FIELDS))
 
@@ -182,4 +219,7 @@ def test_no_rows_say_nothing():
     body, truth, size, rows = scene()
     none = Rows(*(getattr(rows, name)[:, :0] for name in ROW_FIELDS))
     posed = body(truth, size)
-    assert (MomentEquations(sums_of(none, posed), body.part_moves)(posed) == 0).all()
+    equations = MomentEquations(sums_of(none, posed), body.part_moves)
+    assert (equations(posed) == 0).all()
+    assert (equations.by_offset(posed) == 0).all()
+    assert (equations.extent(posed) == 0).all()

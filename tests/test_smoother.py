@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 from synthetic_cloud import RELAXED, see, standing, together
+from test_fitting import body_of, random_pose, random_size, rows_of
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
 from torchpose.least_squares import Status
-from torchpose.registration.fitting import FittingConfig, PosePrior
+from torchpose.registration.fitting import FittingConfig, PosePrior, equations_by_moments
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.vem import Registrar, Registration, RegistrationConfig
 from torchpose.tracking.limb_hypothesis import HypothesisConfig
@@ -64,6 +65,9 @@ def test_a_chain_is_solved_as_its_dense_matrix(T):
     assert torch.linalg.eigvalsh(whole).min() > 0
     x, covariance, left = solve_chain(blocks, beside, right)
     assert_close(x, torch.linalg.solve(whole, right.flatten()).view(T, P))
+    several = torch.randn(T, P, 5, generator=generator, dtype=torch.float64)
+    columns = solve_chain(blocks, beside, several)[0]
+    assert_close(columns, torch.linalg.solve(whole, several.flatten(0, 1)).view(T, P, 5))
     assert_close(covariance, own_blocks(torch.linalg.inv(whole), P))
     for t in range(T):  # the Schur complement: the precision once the frames before are integrated out
         upto = torch.linalg.inv(whole[: (t + 1) * P, : (t + 1) * P])
@@ -154,6 +158,64 @@ def test_a_linear_chain_is_exact_conditioning_of_one_big_gaussian():
     pose, covariance, _ = fitted(noise, mean, Chain(1 / steps, torch.zeros(P, dtype=torch.float64), link))
     assert_close(pose.flatten(), gain @ mean.flatten(), rtol=0, atol=1e-5)
     assert_close(covariance, own_blocks(prior - gain @ prior, P), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("sds", [(0.02, 0.0), (0.0, 0.05), (0.01, 0.03)])
+def test_what_a_parts_points_have_in_common_misleads_all_frames_as_fits_to_shifted_points_do(sds):
+    """Every part's points shifted in all frames along each of its axes, and the chain fitted anew."""
+    torch.manual_seed(2)
+    body = body_of()
+    T, tiny = 3, 1e-5
+    truth = random_pose(body, 1, spread=0.3).expand(T, -1)  # no tension: the equations are linear near here
+    size = random_size(body)
+    rows = rows_of(body, truth, size, per_part=6)
+    rows = replace(
+        rows, direction=rows.direction / 0.02 * (rows.part != 10)[..., None]
+    )  # one that is not seen
+    rest = PosePrior(truth, torch.full_like(truth, 0.3))
+    chain = Chain(
+        torch.full((T - 1, body.num_parameters), 40.0, dtype=torch.float64),
+        truth[0],
+        torch.eye(body.num_parameters, dtype=torch.float64),
+    )
+
+    def equations_of(some):
+        return equations_by_moments(body, size, some, rest, FittingConfig(limit_sd=0.0), body(truth, size))
+
+    before, expected, _ = fit_chain(equations_of(rows), truth, chain, 8)
+    for k in range(body.num_parts):
+        for axis, sd in enumerate((sds[0], sds[0], sds[1])):
+            shift = torch.zeros(body.num_parts, 3, dtype=torch.float64)
+            shift[k, axis] = tiny
+            moved = replace(rows, local=rows.local + shift[rows.part])
+            way = (fit_chain(equations_of(moved), before, chain, 8)[0] - before) * sd / tiny
+            expected = expected + way[:, :, None] * way[:, None]
+    smoother = Smoother(body, Registrar(body), SmoothingConfig(offset_sd=sds[0], slide_sd=sds[1], piece=1.0))
+    found = smoother._covariance(equations_of(rows), before, size, chain)
+    assert_close(found, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_a_limb_of_which_only_the_top_shows_turns_by_more_than_one_that_shows_in_full(body, scene):
+    """With the legs hidden but for 8 cm below the hips, a shift of 3 cm is worth 0.2 rad and more of the thigh."""
+    pose, observation, registrar, _ = scene
+    pose, observation = pose[:2], observation.take(torch.tensor([0, 1]))
+    hips = body(pose).joints[:, 9:11, 1].mean(1)[:, None]
+    shown = observation.cloud.mask & (observation.cloud.points[..., 1] < hips + 0.08)
+    sds = []
+    for mask in (observation.cloud.mask, shown):
+        seen = replace(observation, cloud=replace(observation.cloud, mask=mask))
+        found = registrar(seen, pose, body.default_size(1))
+        each = []
+        for offset in (0.0, 0.03):
+            config = SmoothingConfig(
+                offset_sd=offset, slide_sd=0.0, piece=1.0, sweeps=0, hypotheses=HypothesisConfig(sweeps=0)
+            )
+            smooth = Smoother(body, registrar, config)(seen, times(2), found, body.default_size(1))
+            each.append(smooth.registration.covariance[0].diagonal())
+        sds.append((each[1] - each[0]).clamp_min(0).sqrt())
+    raised = [body.parameter_names.index(f"thigh_{side}_1") for side in ("left", "right")]
+    assert (sds[1][raised] > 0.2).all()
+    assert (sds[1][raised] > 2 * sds[0][raised]).all()
 
 
 def test_unseen_frames_lie_between_their_neighbours_and_less_surely_the_farther_these_are():
@@ -350,7 +412,7 @@ def test_a_frame_without_points_has_its_neighbours_pose_and_greater_doubt(body, 
     mask[2:4] = False
     blind = replace(observation, cloud=replace(observation.cloud, mask=mask))
     # One place for each limb: several add what a bridge between two frames does not know.
-    alone = SmoothingConfig(sweeps=0, hypotheses=HypothesisConfig(sweeps=0))
+    alone = SmoothingConfig(sweeps=0, hypotheses=HypothesisConfig(sweeps=0), offset_sd=0.0, slide_sd=0.0)
     smoother = Smoother(body, registrar, alone)
     size = body.default_size(1)
     seen = smoother(observation, times(6), found, size).registration
@@ -398,10 +460,12 @@ def test_a_turn_of_two_pi_between_frames_is_none(body, scene):
 
 
 def test_one_frame_alone_keeps_its_pose(body, scene):
-    pose, observation, registrar, _ = scene
+    pose, observation, _, _ = scene
+    registrar = Registrar(body, RegistrationConfig(tangential=0.0))
     one = observation.take(torch.tensor([1]))
     found = registrar(one, pose[1:2], body.default_size(1))
-    smooth = Smoother(body, registrar)(one, times(1), found, body.default_size(1))
+    config = SmoothingConfig(rounds=12, offset_sd=0.0, slide_sd=0.0)
+    smooth = Smoother(body, registrar, config)(one, times(1), found, body.default_size(1))
     assert miss(body, smooth.registration, pose[1:2]).max() < 0.02
     assert_close(torch.linalg.inv(smooth.filtered), smooth.registration.covariance, rtol=1e-2, atol=1e-5)
 
@@ -461,7 +525,8 @@ def test_the_truth_lies_within_two_sd(body, labelled):
     With the true labels told 95.7 % are; with labels found at a sigma near the noise 92.9 %. At a sigma of 2 cm it is
     60 % (noise 2 mm): beside the joints labels are wrong by more than the noise.
     """
-    noise, T, config = 0.002, 4, SmoothingConfig(sweeps=0, rounds=6, joint_drift=0.3, root_drift=0.2)
+    noise, T = 0.002, 4
+    config = SmoothingConfig(sweeps=0, rounds=6, joint_drift=0.3, root_drift=0.2, offset_sd=0.0, slide_sd=0.0)
     registrar = Registrar(
         body,
         RegistrationConfig(
@@ -531,6 +596,9 @@ def test_taken_rows_are_the_frames_one_by_one_and_put_back(scene):
         ({"ahead": -1}, "0 <= ahead < stretch must hold, in frames, got -1 and 50"),
         ({"joint_drift": 0.0}, "joint_drift must be positive, got 0.0"),
         ({"rest_time": math.nan}, "rest_time must be positive, got nan"),
+        ({"piece": 0.5}, "piece must be at least 1, got 0.5"),
+        ({"offset_sd": -0.01}, "offset_sd must not be negative, got -0.01; 0 switches it off"),
+        ({"slide_sd": -0.02}, "slide_sd must not be negative, got -0.02; 0 switches it off"),
     ],
 )
 def test_bad_settings_are_told(setting, message):

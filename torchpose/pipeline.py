@@ -60,9 +60,9 @@ class PoseConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     start: StartConfig = field(default_factory=StartConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    shape_sd: float = (
-        0.05  # rad, by which a body that is not quite the person's misleads every joint, in all frames alike
-    )
+    # rad, by which a body that is not quite the person's misleads every joint, in all frames alike, beside what
+    # `smoothing.offset_sd` says of each part
+    shape_sd: float = 0.02
     place_sd: float = 0.02  # m, the same for where the person is
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them

@@ -35,6 +35,7 @@ def _places() -> Int[Tensor, "169"]:
 
 PLACES = _places()
 BOTTOM = torch.tensor([0.0, 0.0, 0.0, 1.0])  # a frame's fourth row
+SHIFT = [3, 7, 11]  # the entries n of a
 SLIDES = 3  # the first parameters of a pose move the body along their axes, the others turn it about them
 
 
@@ -94,6 +95,33 @@ class MomentEquations:
 
     def __call__(self, posed: PosedBody) -> Float[Tensor, "batch parameters_1 parameters_1"]:
         """(J | r)^T (J | r), summed over the rows: J^T J, beside it J^T r, and |r|^2 in the corner."""
+        columns = self._columns(posed)
+        return columns.flatten(1, 2).mT @ (self.moments.matrix @ columns).flatten(1, 2)
+
+    def by_offset(self, posed: PosedBody) -> Float[Tensor, "batch parameters parts_3"]:
+        """J^T N, 1/m, N the derivatives of the residuals by a shift of each part's points, along the part's axes.
+
+        Of equations J^T J x = -J^T r, -(J^T J)^-1 J^T N b is how far x goes where all points of each part are off by b.
+        """
+        frames = self.moments.matrix.new_zeros(*posed.frames.shape[:2], 13, 3)
+        frames[..., SHIFT, :] = posed.frames
+        own = (self.moments.matrix @ frames).mT  # (B, K, 3, 13): each part's rows hear of its own shift alone
+        return (own @ self._columns(posed)[..., :-1]).flatten(1, 2).mT
+
+    def extent(self, posed: PosedBody) -> Float[Tensor, "batch parts"]:
+        """How far the rows of each part are spread along it: their variance to that of an even spread over its length.
+
+        The weights are the directions' squares; a part without rows has 0.
+        """
+        z, one = [2, 6, 10], SHIFT  # the entries n h_2 and n of a: their products, added over n
+        matrix = self.moments.matrix
+        square, first, weight = (matrix[..., i, j].sum(-1) for i, j in ((z, z), (z, one), (one, one)))
+        weight = torch.where(weight > 0, weight, 1.0)
+        variance = (square / weight - (first / weight).square()).clamp_min(0)
+        return 3 * variance / posed.radii[..., 2].square()
+
+    def _columns(self, posed: PosedBody) -> Float[Tensor, "batch parts 13 parameters_1"]:
+        """What the derivatives by the parameters, and the residual, take of each part's a."""
         moments = self.moments
         frames = _frames(posed, moments.pivot)
         B, K = frames.shape[:2]
@@ -108,8 +136,7 @@ class MomentEquations:
         # a^T (dT, 0) = -dr and a^T (T - T_0, -1) = -r: the signs meet.
         last = both.new_zeros(both.shape[-1])
         last[-1] = -1
-        columns = torch.cat([both.flatten(2, 3), last.expand(B, K, 1, -1)], 2)  # (B, K, 13, P + 1)
-        return columns.flatten(1, 2).mT @ (moments.matrix @ columns).flatten(1, 2)
+        return torch.cat([both.flatten(2, 3), last.expand(B, K, 1, -1)], 2)
 
 
 def _frames(posed: PosedBody, pivot: Tensor) -> Float[Tensor, "batch parts 3 4"]:

@@ -323,9 +323,14 @@ class Registrar(nn.Module):
         labelling: Labelling,
         observation: Observation,
         rim: bool = True,
+        tangential: float | None = None,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
-        rows, support = self._point_rows(posed, foot, labelling.belief, observation)
+        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part.
+
+        `tangential` overrides the config.
+        """
+        tangential = self.config.tangential if tangential is None else tangential
+        rows, support = self._point_rows(posed, foot, labelling.belief, observation, tangential)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(
                 posed, observation.nearest, observation.camera, self.config.rim, observation.frame
@@ -343,6 +348,7 @@ class Registrar(nn.Module):
         foot: Correspondence,
         belief: Float[Tensor, "batch labels num"],
         observation: Observation,
+        tangential: float,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
         """Three rows for each pair of point and part, all first coordinates first; and the points on each part.
 
@@ -376,7 +382,7 @@ class Registrar(nn.Module):
         scale = torch.where(weight > 0, weight.clamp_min(tiny).sqrt(), 0.0) / config.noise_sd
         frames = posed.frames.flatten(2).mT.gather(2, part[:, None].expand(-1, 9, -1)).unflatten(1, (3, 3))
         normal = (frames * normal[:, None]).sum(2)
-        slack: float | Tensor = 1 - config.tangential
+        slack: float | Tensor = 1 - tangential
         if (
             observation.depth_noise > 0
         ):  # normals of the flatter body, which say little of where a limb may slide
@@ -384,7 +390,7 @@ class Registrar(nn.Module):
             ray = nn.functional.normalize(posed.centers, dim=-1).mT.gather(2, part[:, None].expand(-1, 3, -1))
             normal = normal + (1 / trust - 1) * (ray * normal).sum(1, keepdim=True) * ray
             normal = nn.functional.normalize(normal, dim=1)
-            slack = (slack * trust)[:, None]
+            slack = (slack * trust)[:, None] if tangential > 0 else slack
         # Along the normal the distance counts in full; along the surface only as far as asked, which lets a limb slide
         # to where it fits. A point behind the rim differs from its foot along the surface too, and counts less there.
         eye = torch.eye(3, dtype=normal.dtype, device=normal.device)[..., None]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
 from torchpose.least_squares import NormalEquations, Status
-from torchpose.registration.fitting import PosePrior, equations_by_moments
+from torchpose.registration.fitting import PoseEquations, PosePrior, equations_by_moments
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses, unoccluded
 
@@ -36,6 +36,11 @@ class SmoothingConfig:
     stretch: int = 50  # frames that are smoothed at once
     ahead: int = 12  # coming frames that they hear of
     rest_time: float = 2.0  # s after which an unseen limb forgets where it was
+    # Of what all points of a part have in common, in all frames: m by which they may be off across it and along it, as
+    # surface, joints and borders are not quite the person's. It says how sure the poses are and does not move them.
+    offset_sd: float = 0.01
+    slide_sd: float = 0.02
+    piece: float = 3.0  # times as much for a piece of a part as for all of it
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
 
     def __post_init__(self) -> None:
@@ -48,6 +53,13 @@ class SmoothingConfig:
         for name in ("apart", "joint_drift", "root_drift", "rest_time"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("offset_sd", "slide_sd"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
+        if not self.piece >= 1:
+            raise ValueError(
+                f"piece must be at least 1, got {self.piece}; 1 takes pieces of parts for whole ones"
+            )
 
 
 @dataclass(frozen=True)
@@ -156,7 +168,11 @@ class Smoother(nn.Module):
             pose, between = self.hypotheses(observation, pose, size, chain.pull, self._rest_share(time_s))
         for _ in range(self.config.rounds):
             equations = self._equations(observation, pose, size, time_s)
-            pose, covariance, filtered = fit_chain(equations, pose, chain, self.config.steps)
+            pose, _, filtered = fit_chain(equations, pose, chain, self.config.steps)
+        if self.config.rounds:
+            # A point's foot slides over the surface: it says where the surface is, nothing along it.
+            equations = self._equations(observation, pose, size, time_s, tangential=0.0)
+            covariance = self._covariance(equations, pose, size, chain)
         nothing = PosePrior(pose, torch.zeros_like(pose))
         status = torch.where(is_finite(tracked), best.status, int(Status.NON_FINITE))
         result = self.registrar.evaluate(observation, pose, size, nothing, best.bound, status)
@@ -216,18 +232,47 @@ class Smoother(nn.Module):
         return now
 
     def _equations(
-        self, observation: Observation, pose: Tensor, size: Tensor, time_s: Tensor
-    ) -> NormalEquations:
+        self,
+        observation: Observation,
+        pose: Tensor,
+        size: Tensor,
+        time_s: Tensor,
+        tangential: float | None = None,
+    ) -> PoseEquations:
         """Of each frame alone, with the labels that its points have at this pose."""
         registrar = self.registrar
         posed = self.body(pose, size)
         foot = registrar.correspond(posed, observation)
         observation = unoccluded(observation, posed, self.config.hypotheses.occlusion)
         labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
-        rows, support = registrar.rows(posed, foot, labelling, observation)
+        rows, support = registrar.rows(posed, foot, labelling, observation, tangential=tangential)
         rest = registrar.with_rest(PosePrior(pose, torch.zeros_like(pose)), support)
         rest = PosePrior(rest.mean, rest.precision * self._rest_share(time_s))
         return equations_by_moments(self.body, size, rows, rest, registrar.config.fitting, posed)
+
+    def _covariance(
+        self, equations: PoseEquations, pose: Float[Tensor, "frames parameters"], size: Tensor, chain: Chain
+    ) -> Float[Tensor, "frames parameters parameters"]:
+        """Of the poses given all frames: from each point's own errors, and from those of a part's points together.
+
+        A part's surface is not quite the person's, and labels end elsewhere than its points do: its points are off by
+        one shift in all frames, normal with `offset_sd` across the part and `slide_sd` along it. The poses follow it as
+        the chain's equations say: a limb that shows in full hardly turns, one of which only the top shows does.
+        """
+        posed = self.body(pose, size)
+        _, _, normal = equations.at(pose, posed)
+        pushed = equations.of_rows.by_offset(posed)
+        sound = (normal.isfinite() & pushed.isfinite().all(2, keepdim=True)).all((1, 2), keepdim=True)
+        floor = torch.full_like(pose, FLOOR).diag_embed()
+        blocks = torch.where(sound, normal, 0.0) + chain.blocks() + floor
+        # A part's long axis is its last. What a whole part's points have in common the sizes have taken up; where only
+        # a piece of it shows, its points may be off by more.
+        across, along = self.config.offset_sd, self.config.slide_sd
+        more = 1 + (self.config.piece - 1) * (1 - equations.of_rows.extent(posed).clamp_max(1))
+        sd = more[..., None] * pose.new_tensor([across, across, along])
+        pushed = torch.where(sound, pushed * sd.flatten(1)[:, None], 0.0)
+        followed, own, _ = solve_chain(blocks, -chain.pull, pushed)
+        return own + followed @ followed.mT
 
     def _rest_share(self, time_s: Tensor) -> float:
         """Frame after frame an unseen limb would be drawn to rest anew: one pull in `rest_time` is meant."""
@@ -279,28 +324,30 @@ def fit_chain(
 
 
 def solve_chain(
-    blocks: Float[Tensor, "frames p p"], beside: Float[Tensor, "frames_1 p"], right: Float[Tensor, "frames p"]
-) -> tuple[Float[Tensor, "frames p"], Float[Tensor, "frames p p"], Float[Tensor, "frames p p"]]:
-    """Solution of a symmetric block tridiagonal system, the diagonal blocks of the matrix's inverse, and the diagonal
-    blocks that elimination leaves (a frame's precision given those before it).
+    blocks: Float[Tensor, "frames p p"],
+    beside: Float[Tensor, "frames_1 p"],
+    right: Float[Tensor, "frames p *columns"],
+) -> tuple[Float[Tensor, "frames p *columns"], Float[Tensor, "frames p p"], Float[Tensor, "frames p p"]]:
+    """Solution of a symmetric block tridiagonal system for one right side or for several as columns, the diagonal
+    blocks of the matrix's inverse, and those that elimination leaves (a frame's precision given those before it).
 
     The blocks beside the diagonal are diagonal themselves, `beside`. Elimination forward and substitution back, as the
     smoother of Rauch, Tung and Striebel.
     """
-    T = len(blocks)
-    left, inverse, value = [blocks[0]], [torch.linalg.inv(blocks[0])], [right[0]]
+    T, columns = len(blocks), right.reshape(*right.shape[:2], -1)
+    left, inverse, value = [blocks[0]], [torch.linalg.inv(blocks[0])], [columns[0]]
     for t in range(1, T):
         b = beside[t - 1]
         left.append(blocks[t] - b[:, None] * inverse[-1] * b)
         inverse.append(torch.linalg.inv(left[-1]))
-        value.append(right[t] - b * (inverse[t - 1] @ value[-1]))
+        value.append(columns[t] - b[:, None] * (inverse[t - 1] @ value[-1]))
     x, covariance = [inverse[-1] @ value[-1]], [inverse[-1]]
     for t in range(T - 2, -1, -1):
         b = beside[t]
-        x.append(inverse[t] @ (value[t] - b * x[-1]))
+        x.append(inverse[t] @ (value[t] - b[:, None] * x[-1]))
         gain = inverse[t] * b
         covariance.append(inverse[t] + gain @ covariance[-1] @ gain.T)
-    return torch.stack(x[::-1]), torch.stack(covariance[::-1]), torch.stack(left)
+    return torch.stack(x[::-1]).view_as(right), torch.stack(covariance[::-1]), torch.stack(left)
 
 
 def _unwound(angles: Float[Tensor, "frames 3"], before: Message | None) -> Float[Tensor, "frames 3"]:
