@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from synthetic_cloud import RELAXED, see, standing
+from synthetic_cloud import RELAXED, see, standing, together
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
@@ -96,6 +96,22 @@ def test_a_limb_that_is_elsewhere_is_found_by_a_refresh(body, starter, changes):
     assert found.score < stuck.score + 1
 
 
+def test_frames_refreshed_together_have_the_answers_of_each_alone(body, starter):
+    """Of different points, silhouettes, sizes and priors."""
+    poses = [standing(body, limbs(body, **WAVE), x=-0.4), standing(body, x=0.4, yaw=0.4)]
+    sizes = torch.cat([body.size_of_height(1.65), body.size_of_height(1.85)])
+    views = [see(body, pose, size[None], num=200) for pose, size in zip(poses, sizes, strict=True)]
+    start = torch.cat([standing(body, x=-0.38), standing(body, x=0.42, yaw=0.4)])
+    prior = PosePrior(start, torch.tensor([[1.0], [20.0]]).expand(2, 24))
+    both = starter.refresh(together(views), start, sizes, prior)
+    for k in range(2):
+        row = slice(k, k + 1)
+        own = PosePrior(start[row], prior.precision[row])
+        alone = starter.refresh(views[k].observation(), start[row], sizes[row], own)
+        for name in ("pose", "covariance", "score", "misfit", "distance"):
+            assert_close(getattr(both, name)[row], getattr(alone, name), rtol=1e-3, atol=1e-4)
+
+
 def test_a_refresh_weighs_its_answers_with_the_prior(body, starter):
     """Of a loose prior nothing is felt, a sure one is not left."""
     pose = standing(body, limbs(body, **WAVE))
@@ -147,7 +163,7 @@ def test_exchanged_limbs_are_all_pairs_of_the_best(body, starter):
     poses = standing(body).repeat(10, 1)
     poses[:, 6:] += torch.arange(10)[:, None] * 0.01
     misfit = torch.tensor([9.0, 3, 8, 1, 7, 2, 6, 4, 5, 0])
-    combined = starter._exchange(poses, misfit, ("upper_arm", "forearm"))
+    (combined,) = starter._exchange(poses[None], misfit[None], ("upper_arm", "forearm"))
     assert combined.shape == (64, 24)
     left = body.parameter_names.index("forearm_left_1")
     right = body.parameter_names.index("upper_arm_right_2")

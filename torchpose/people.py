@@ -29,7 +29,7 @@ from torchpose.tracking.location import (
     sighting,
 )
 from torchpose.tracking.partition import PartitionConfig, split_people
-from torchpose.tracking.tracker import Person, TrackStatus, track_together
+from torchpose.tracking.tracker import Sought, TrackStatus, track_together
 from torchpose.vision.clump import ArtefactConfig, keep_points, person_points
 from torchpose.vision.colour_histogram import back_projection, colour_histogram, colour_similarity
 from torchpose.vision.faces import FaceMemory
@@ -199,7 +199,7 @@ class People:
                     observation = follower.model.observe(sight, cover)
                 cut = sight is not None and (sight.cut or self._partly(body, cover))
                 asked.append(
-                    Person(
+                    Sought(
                         follower.model.tracker,
                         time_s,
                         observation,
@@ -436,7 +436,7 @@ class People:
         camera = self.model.camera
         return outside | covered[0, v.clamp(0, camera.height - 1), u.clamp(0, camera.width - 1)]
 
-    def _learn(self, follower: Follower, sight: Sight, person: Person, found: Registration) -> None:
+    def _learn(self, follower: Follower, sight: Sight, person: Sought, found: Registration) -> None:
         """The person's clothes, and the size from the first frames in which all of the person is seen."""
         if sight.coloured and not person.cut:
             now = colour_histogram(sight.images, sight.silhouette)

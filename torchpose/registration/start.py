@@ -84,7 +84,7 @@ class Starter(nn.Module):
     ) -> Registration:
         """Register one frame (batch 1) without a known pose."""
         starts = self.hypotheses(observation, faces, size)
-        found = self._search(observation, starts, size, self.config.sigma)
+        found = self._search(observation, starts[None], size, self.config.sigma)
         for _ in range(self.config.refreshes):
             if float(found.misfit) < self.config.good_misfit:
                 break
@@ -97,42 +97,67 @@ class Starter(nn.Module):
     def refresh(
         self,
         observation: Observation,
-        pose: Float[Tensor, "1 parameters"],
+        pose: Float[Tensor, "batch parameters"],
         size: Float[Tensor, "#batch sizes"],
         prior: PosePrior | None = None,
     ) -> Registration:
-        """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
+        """Register frames from poses of which some limbs may be wrong: each limb is tried elsewhere too."""
         few = thin(observation, self.config.points)
-        limbs = self.limb_search(few, pose, size)
+        limbs = self.limb_search(few, pose, size)  # (B, limbs, best, P)
         together = pose.clone()
-        for own, best in zip(self.limb_search.limbs, limbs[:, 0], strict=True):
-            together[:, own] = best[own]
-        starts = torch.cat([pose, together, limbs.flatten(0, 1)])
+        for k, own in enumerate(self.limb_search.limbs):
+            together[:, own] = limbs[:, k, 0, own]
+        starts = torch.cat([pose[:, None], together[:, None], limbs.flatten(1, 2)], 1)
         return self._search(observation, starts, size, self.config.refresh_sigma, prior)
 
     def _search(
         self,
         observation: Observation,
-        starts: Float[Tensor, "starts parameters"],
+        starts: Float[Tensor, "batch starts parameters"],
         size: Float[Tensor, "#batch sizes"],
         sigma: float,
         prior: PosePrior | None = None,
     ) -> Registration:
-        """Every start is fitted on a few points, the limbs of the good ones are exchanged in all pairs, and the best
-        few combinations are fitted on all points. The registration with the least misfit is returned."""
-        few = thin(observation, self.config.points)
-        rough = self.coarse(few, starts, size, _each(prior, len(starts)), self.config.rounds, sigma)
-        misfit = self._score(rough)
-        arms = self._exchange(rough.pose, misfit, ("upper_arm", "forearm"))
-        legs = self._exchange(rough.pose, misfit, ("thigh", "shank"))
-        combined = torch.cat([rough.pose, arms, legs])
+        """Every start of each frame is fitted on a few points, the limbs of the good ones are exchanged in all pairs,
+        and the best few combinations are fitted on all points. Of each frame the registration with the least misfit is
+        returned."""
+        few, (B, S) = thin(observation, self.config.points), starts.shape[:2]
+        rough = self._fit(self.coarse, few, starts, size, prior, self.config.rounds, sigma)
+        pose, score = rough.pose.unflatten(0, (B, S)), self._score(rough).view(B, S)
+        arms = self._exchange(pose, score, ("upper_arm", "forearm"))
+        legs = self._exchange(pose, score, ("thigh", "shank"))
+        combined = torch.cat([pose, arms, legs], 1)
         last = self.registrar.config.sigma_last
-        again = self.coarse(few, combined, size, _each(prior, len(combined)), 1, last)
-        best = self._score(again).topk(min(self.config.finalists, len(combined)), largest=False).indices
-        final = self.registrar(
-            observation, again.pose[best], size, _each(prior, len(best)), self.config.final_rounds
+        again = self._fit(self.coarse, few, combined, size, prior, 1, last)
+        pose, score = again.pose.view_as(combined), self._score(again).view(B, -1)
+        best = score.topk(min(self.config.finalists, score.shape[1]), largest=False).indices
+        finalists = pose.gather(1, best[..., None].expand(-1, -1, pose.shape[2]))
+        final = self._fit(
+            self.registrar, observation, finalists, size, prior, self.config.final_rounds, covariance=True
         )
-        return final.take(self._score(final).argmin()[None])
+        first = torch.arange(0, len(final.pose), best.shape[1], device=best.device)
+        return final.take(first + self._score(final).view(best.shape).argmin(1))
+
+    @staticmethod
+    def _fit(
+        registrar: Registrar,
+        observation: Observation,
+        starts: Float[Tensor, "batch starts parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior | None,
+        rounds: int,
+        sigma: float | None = None,
+        covariance: bool = False,
+    ) -> Registration:
+        """All starts of all frames as one batch, those of one frame after those of another."""
+        B, S, _ = starts.shape
+        row = torch.arange(B, device=starts.device).repeat_interleave(S)
+        if prior is not None:
+            prior = PosePrior(prior.mean[row], prior.precision[row])
+        sizes = size.expand(B, -1)[row]
+        return registrar(
+            observation.share(row), starts.flatten(0, 1), sizes, prior, rounds, sigma, covariance
+        )
 
     def _score(self, found: Registration) -> Float[Tensor, " starts"]:
         return found.score.nan_to_num(nan=torch.inf) + self.config.back_penalty * self._turned_away(
@@ -164,21 +189,20 @@ class Starter(nn.Module):
 
     def _exchange(
         self,
-        pose: Float[Tensor, "starts parameters"],
-        misfit: Float[Tensor, " starts"],
+        pose: Float[Tensor, "batch starts parameters"],
+        misfit: Float[Tensor, "batch starts"],
         limb: tuple[str, str],
-    ) -> Float[Tensor, "combinations parameters"]:
+    ) -> Float[Tensor, "batch combinations parameters"]:
         """The best start with each left and each right limb of the eight best starts."""
         names = self.body.parameter_names
-        sides = [
-            [i for i, name in enumerate(names) if name.startswith((limb[0] + side, limb[1] + side))]
-            for side in ("_left", "_right")
-        ]
-        order = misfit.argsort()[:8]
-        left, right = (part.flatten() for part in torch.meshgrid(order, order, indexing="ij"))
-        combined = pose[order[:1]].repeat(len(left), 1)
-        for index, chosen in zip(sides, (left, right), strict=True):
-            combined[:, index] = pose[chosen][:, index]
+        order = misfit.argsort(1)[:, :8]
+        good = pose.gather(1, order[..., None].expand(-1, -1, pose.shape[2]))  # (B, 8, P), the best first
+        rank = torch.arange(good.shape[1], device=pose.device)
+        left, right = (part.flatten() for part in torch.meshgrid(rank, rank, indexing="ij"))
+        combined = good[:, :1].repeat(1, len(left), 1)
+        for side, chosen in (("_left", left), ("_right", right)):
+            own = [i for i, name in enumerate(names) if name.startswith((limb[0] + side, limb[1] + side))]
+            combined[..., own] = good[:, chosen][..., own]
         return combined
 
     def turned_away(self, found: Registration) -> bool:
@@ -212,13 +236,6 @@ def pelvis_position(
     x, z = torch.where(x.isfinite(), x, middle[:, 0]), torch.where(z.isfinite(), z, middle[:, 2])
     # The cloud is the body's front: the hips lie half a trunk's depth behind it.
     return torch.stack([x, y, z + 0.11], -1)
-
-
-def _each(prior: PosePrior | None, batch: int) -> PosePrior | None:
-    """The same prior for every start."""
-    return (
-        None if prior is None else PosePrior(prior.mean.expand(batch, -1), prior.precision.expand(batch, -1))
-    )
 
 
 def _directions(

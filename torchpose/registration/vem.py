@@ -126,7 +126,12 @@ class Observation:
         return Observation(cloud, self.potential[index], nearest, self.camera, geodesic)
 
     def share(self, index: Tensor) -> "Observation":
-        """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames."""
+        """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames.
+
+        Of a single frame, whose rows are all the same, nothing is copied.
+        """
+        if len(self.potential) == 1:
+            return self.expand(len(index))
         few = replace(self, nearest=self.nearest[:1]).take(index)
         return (
             few
@@ -212,22 +217,37 @@ class Registrar(nn.Module):
         prior: PosePrior | None = None,
         rounds: int | None = None,
         sigma_first: float | None = None,
+        covariance: bool = True,
     ) -> Registration:
         """Register from `start`. A row that is not finite keeps its start, with status NON_FINITE.
 
         Args:
             prior: what earlier frames say of the pose; None says nothing.
             rounds, sigma_first: override the config, for a cold start.
+            covariance: as for `evaluate`.
         """
-        config, B = self.config, start.shape[0]
-        observation = observation.expand(B)
         if prior is None:
             prior = PosePrior(start, torch.zeros_like(start))
+        solution, posed, bound = self.approach(observation, start, size, prior, rounds, sigma_first)
+        pose, status = solution.value, solution.status
+        return self.evaluate(observation, pose, size, prior, bound, status, posed, covariance)
+
+    def approach(
+        self,
+        observation: Observation,
+        start: Float[Tensor, "batch parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior,
+        rounds: int | None = None,
+        sigma_first: float | None = None,
+    ) -> tuple[Solution, PosedBody, Float[Tensor, "rounds batch"]]:
+        """The rounds of `forward` alone: the last M-step's answer, the body there, and the bound of each VE-step."""
+        config, B = self.config, start.shape[0]
+        observation = observation.expand(B)
         rounds = rounds or config.rounds
         sigma_first = sigma_first or config.sigma_first
         pose, bounds = start, []
         posed = self.body(pose, size)
-        status = torch.full((B,), int(Status.MAX_STEPS), device=start.device)
         for i in range(rounds):
             share = i / max(rounds - 1, 1)
             sigma = sigma_first ** (1 - share) * config.sigma_last**share
@@ -238,8 +258,8 @@ class Registrar(nn.Module):
             rows, support = self.rows(posed, foot, labelling, observation, rim)
             full = self.with_rest(prior, support)
             solution, posed = self.fit(pose, size, rows, full, posed)
-            pose, status = solution.value, solution.status
-        return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status, posed)
+            pose = solution.value
+        return solution, posed, torch.stack(bounds)
 
     def fit(
         self,
@@ -371,21 +391,24 @@ class Registrar(nn.Module):
         bound: Tensor,
         status: Tensor,
         posed: PosedBody | None = None,
+        covariance: bool = True,
     ) -> Registration:
-        """What speaks for a pose, with the body `posed` there if it is at hand."""
-        config, cloud = self.config, observation.cloud
+        """What speaks for a pose, with the body `posed` there if it is at hand.
+
+        Without `covariance` that is NaN: half of the time, for those who compare many poses.
+        """
+        config, observation = self.config, observation.expand(len(pose))
+        cloud = observation.cloud
         posed = self.body(pose, size) if posed is None else posed
         foot = self.correspond(posed, observation)
         labelling = self.label(posed, foot, observation, config.sigma_last)
         rows, support = self.rows(posed, foot, labelling, observation)
         full = self.with_rest(prior, support)
-        equations = equations_by_moments(self.body, size, rows, full, config.fitting, posed)
-        _, _, information = equations.at(pose, posed)
-        factor, failed = torch.linalg.cholesky_ex(information)
-        known = (failed == 0)[:, None, None]
-        # cholesky_inverse raises for the whole batch where one factor is singular.
-        eye = torch.eye(pose.shape[1], dtype=pose.dtype, device=pose.device)
-        covariance = torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
+        if covariance:
+            equations = equations_by_moments(self.body, size, rows, full, config.fitting, posed)
+            doubt = _inverse(equations.at(pose, posed)[2])
+        else:
+            doubt = pose.new_tensor(torch.nan).expand(*pose.shape, pose.shape[1])
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.foot.distance.amin(1) * cloud.mask
         # Of the rows the points' come first; the bound stands in for them, with every label and none.
@@ -397,8 +420,19 @@ class Registrar(nn.Module):
         if config.rim.weight > 0:
             misfit = misfit + overhang_of(rims, config.rim)
         return Registration(
-            pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
+            pose, doubt, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
         )
+
+
+def _inverse(
+    information: Float[Tensor, "batch parameters parameters"],
+) -> Float[Tensor, "batch parameters parameters"]:
+    """Of symmetric matrices; infinite where one is not positive definite."""
+    factor, failed = torch.linalg.cholesky_ex(information)
+    known = (failed == 0)[:, None, None]
+    # cholesky_inverse raises for the whole batch where one factor is singular.
+    eye = torch.eye(information.shape[1], dtype=information.dtype, device=information.device)
+    return torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
 
 
 def stack_registrations(found: Sequence[Registration]) -> Registration:
