@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpose.body.model import PosedBody
 from torchpose.export import JOINT_NAMES
 from torchpose.eyes import Sight, View
-from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose
+from torchpose.pipeline import FramePose, StereoToPose
 from torchpose.recording import Frame, Recording, UnreadableFrame
 from torchpose.registration.vem import Observation, Registration
 from torchpose.tracking.kalman import Gaussian
@@ -36,6 +36,7 @@ from torchpose.vision.faces import FaceMemory
 from torchpose.vision.head import HeadConfig, find_head
 from torchpose.vision.skin import SkinModel
 from torchpose.vision.trunk import TrunkConfig, find_trunk
+from torchpose.window import PeopleWindows
 
 FACE_TO_HEAD = (0.0, -0.06, 0.08)  # m, from a face's surface to the head's centre, as measured on `people`
 
@@ -150,7 +151,7 @@ class People:
 
     def __call__(self, recording: Recording) -> Iterator[list[FramePose]]:
         """Smoothed poses of a prepared recording's frames, in order: those of everybody who was there so far."""
-        windows = PeopleWindows(self)
+        windows = PeopleWindows(self.followers)
         for position in range(len(recording)):
             yield from windows.push(self.step(recording, position))
         yield from windows.flush()
@@ -461,42 +462,9 @@ class People:
             follower.restore(state)
 
 
-class PeopleWindows:
-    """A smoothing window for each person, which fill and empty together."""
-
-    def __init__(self, people: People, states: Sequence[Mapping[str, Tensor]] | None = None):
-        self.people = people
-        self.windows: list[SmoothingWindow] = []
-        for k, follower in enumerate(people.followers):
-            self.windows.append(
-                SmoothingWindow(follower.model, states[k] if states else None, follower.state)
-            )
-
-    def push(self, poses: list[FramePose]) -> list[list[FramePose]]:
-        """Take the next frame of everybody; the frames that are ready, of everybody, often none."""
-        for k in range(len(self.windows), len(poses)):
-            follower = self.people.followers[k]
-            window = SmoothingWindow(follower.model, None, follower.state)
-            # Not pushed: of a time before somebody came there is no state to go on from.
-            window.waiting = [
-                replace(earlier, status=TrackStatus.absent, registration=None, sight=None, observation=None)
-                for earlier in self.windows[0].waiting
-            ]
-            self.windows.append(window)
-        return _by_frame([window.push(pose) for window, pose in zip(self.windows, poses, strict=True)])
-
-    def flush(self) -> list[list[FramePose]]:
-        """The frames that are left at the end of the recording."""
-        return _by_frame([window.flush() for window in self.windows])
-
-
 def _spread(place: Gaussian) -> Float[Tensor, " batch"]:
     """The greatest standard deviation of a place's coordinates, m."""
     return place.covariance.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
-
-
-def _by_frame(poses: list[list[FramePose]]) -> list[list[FramePose]]:
-    return [list(frame) for frame in zip(*poses, strict=True)]
 
 
 def _together(bodies: list[PosedBody]) -> PosedBody | None:
