@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchpose.body.ellipsoid import foot_point, rough_distance
 from torchpose.body.model import BodyModel, PosedBody
-from torchpose.registration.silhouette import silhouette_rows
+from torchpose.registration.silhouette import silhouette_residual
 from torchpose.registration.vem import Observation, Registrar
 
 # A limb is a body on the root that others hang from: its joint, and that of the body after it, have four parameters.
@@ -112,10 +112,10 @@ class LimbSearch(nn.Module):
         share = (registrar.config.effective_points / mask.sum(3).clamp_min(1)).clamp_max(1)
         score = share * (torch.logaddexp(rest[:, None], inside) * mask).sum(3)
         if registrar.config.rim.weight > 0:
-            rows = silhouette_rows(
+            rims = silhouette_residual(
                 limbs, observation.nearest, observation.camera, registrar.config.rim, observation.frame
             )
-            score = score - 0.5 * rows.residual(limbs).square().unflatten(1, (C, L, -1)).sum(3)
+            score = score - 0.5 * rims.square().unflatten(1, (C, L, -1)).sum(3)
         return score.transpose(1, 2)
 
     def _rest_of_body(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from math import cos, pi, radians, sin
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
@@ -50,6 +50,8 @@ class StartConfig:
     final_rounds: int = 8  # of the best few, on all points
     finalists: int = 4
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
+    exchanged: int = 8  # best starts whose limbs are exchanged
+    apart: float = 0.1  # rad by which limbs differ that are exchanged: the others end in the same place
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
     refresh_sigma: float = 0.05  # m, in a refresh's first round: all but a limb or two are right
@@ -59,9 +61,11 @@ class StartConfig:
     back_penalty: float = 4.0  # nats that a pose turned away from the camera must make good
 
     def __post_init__(self) -> None:
-        for name in ("points", "rounds", "final_rounds", "finalists"):
+        for name in ("points", "rounds", "final_rounds", "finalists", "exchanged"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.apart < 0:
+            raise ValueError(f"apart must not be negative, got {self.apart}; 0 exchanges all limbs")
         if not (self.yaws and self.face_yaws):
             raise ValueError("yaws and face_yaws need at least one angle each, in degrees")
 
@@ -121,43 +125,44 @@ class Starter(nn.Module):
         """Every start of each frame is fitted on a few points, the limbs of the good ones are exchanged in all pairs,
         and the best few combinations are fitted on all points. Of each frame the registration with the least misfit is
         returned."""
-        few, (B, S) = thin(observation, self.config.points), starts.shape[:2]
-        rough = self._fit(self.coarse, few, starts, size, prior, self.config.rounds, sigma)
-        pose, score = rough.pose.unflatten(0, (B, S)), self._score(rough).view(B, S)
-        arms = self._exchange(pose, score, ("upper_arm", "forearm"))
-        legs = self._exchange(pose, score, ("thigh", "shank"))
-        combined = torch.cat([pose, arms, legs], 1)
-        last = self.registrar.config.sigma_last
-        again = self._fit(self.coarse, few, combined, size, prior, 1, last)
-        pose, score = again.pose.view_as(combined), self._score(again).view(B, -1)
-        best = score.topk(min(self.config.finalists, score.shape[1]), largest=False).indices
-        finalists = pose.gather(1, best[..., None].expand(-1, -1, pose.shape[2]))
-        final = self._fit(
-            self.registrar, observation, finalists, size, prior, self.config.final_rounds, covariance=True
+        few, (B, S, P) = thin(observation, self.config.points), starts.shape
+        row = torch.arange(B, device=starts.device)
+        every = row.repeat_interleave(S)
+        rough = self._fit(
+            self.coarse, few, every, starts.flatten(0, 1), size, prior, self.config.rounds, sigma
         )
-        first = torch.arange(0, len(final.pose), best.shape[1], device=best.device)
-        return final.take(first + self._score(final).view(best.shape).argmin(1))
+        pose, score = rough.pose.view(B, S, P), self._score(rough).view(B, S)
+        arms, new_arms = self._exchange(pose, score, ("upper_arm", "forearm"))
+        legs, new_legs = self._exchange(pose, score, ("thigh", "shank"))
+        combined = torch.cat([pose, arms, legs], 1)
+        new = torch.cat([torch.ones_like(score, dtype=torch.bool), new_arms, new_legs], 1)
+        last, every = self.registrar.config.sigma_last, new.nonzero()[:, 0]
+        again = self._fit(self.coarse, few, every, combined[new], size, prior, 1, last)
+        rank = torch.full_like(combined[..., 0], torch.inf).masked_scatter(new, self._score(again))
+        best = rank.topk(min(self.config.finalists, S), largest=False).indices
+        finalists = combined.masked_scatter(new[..., None], again.pose)
+        finalists = finalists.gather(1, best[..., None].expand(-1, -1, P)).flatten(0, 1)
+        every, rounds = row.repeat_interleave(best.shape[1]), self.config.final_rounds
+        final = self._fit(self.registrar, observation, every, finalists, size, prior, rounds, covariance=True)
+        return final.take(row * best.shape[1] + self._score(final).view_as(best).argmin(1))
 
     @staticmethod
     def _fit(
         registrar: Registrar,
         observation: Observation,
-        starts: Float[Tensor, "batch starts parameters"],
+        frame: Int[Tensor, " rows"],
+        starts: Float[Tensor, "rows parameters"],
         size: Float[Tensor, "#batch sizes"],
         prior: PosePrior | None,
         rounds: int,
         sigma: float | None = None,
         covariance: bool = False,
     ) -> Registration:
-        """All starts of all frames as one batch, those of one frame after those of another."""
-        B, S, _ = starts.shape
-        row = torch.arange(B, device=starts.device).repeat_interleave(S)
+        """Starts of several frames as one batch; `frame` is whose each is."""
         if prior is not None:
-            prior = PosePrior(prior.mean[row], prior.precision[row])
-        sizes = size.expand(B, -1)[row]
-        return registrar(
-            observation.share(row), starts.flatten(0, 1), sizes, prior, rounds, sigma, covariance
-        )
+            prior = PosePrior(prior.mean[frame], prior.precision[frame])
+        sizes = size.expand(len(observation.potential), -1)[frame]
+        return registrar(observation.share(frame), starts, sizes, prior, rounds, sigma, covariance)
 
     def _score(self, found: Registration) -> Float[Tensor, " starts"]:
         return found.score.nan_to_num(nan=torch.inf) + self.config.back_penalty * self._turned_away(
@@ -190,20 +195,26 @@ class Starter(nn.Module):
     def _exchange(
         self,
         pose: Float[Tensor, "batch starts parameters"],
-        misfit: Float[Tensor, "batch starts"],
+        score: Float[Tensor, "batch starts"],
         limb: tuple[str, str],
-    ) -> Float[Tensor, "batch combinations parameters"]:
-        """The best start with each left and each right limb of the eight best starts."""
+    ) -> tuple[Float[Tensor, "batch combinations parameters"], Bool[Tensor, "batch combinations"]]:
+        """The best start with each left and each right limb of the best starts; and which of these combinations are
+        no repetition: not that start itself, and of limbs that differ from those of all better starts."""
         names = self.body.parameter_names
-        order = misfit.argsort(1)[:, :8]
-        good = pose.gather(1, order[..., None].expand(-1, -1, pose.shape[2]))  # (B, 8, P), the best first
+        order = score.argsort(1)[:, : self.config.exchanged]
+        good = pose.gather(1, order[..., None].expand(-1, -1, pose.shape[2]))  # the best first
         rank = torch.arange(good.shape[1], device=pose.device)
         left, right = (part.flatten() for part in torch.meshgrid(rank, rank, indexing="ij"))
         combined = good[:, :1].repeat(1, len(left), 1)
+        new = torch.ones_like(combined[..., 0], dtype=torch.bool)
         for side, chosen in (("_left", left), ("_right", right)):
             own = [i for i, name in enumerate(names) if name.startswith((limb[0] + side, limb[1] + side))]
-            combined[..., own] = good[:, chosen][..., own]
-        return combined
+            limbs = good[..., own]
+            near = (limbs[:, :, None] - limbs[:, None]).abs().amax(3) < self.config.apart
+            combined[..., own] = limbs[:, chosen]
+            new &= ~near.tril(-1).any(2)[:, chosen]
+        new[:, 0] = False
+        return combined, new
 
     def turned_away(self, found: Registration) -> bool:
         """Whether a registration (batch 1) shows the person's back."""
