@@ -26,7 +26,7 @@ from torchpose.registration.fitting import (
     pose_terms,
 )
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
-from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_rows
+from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_residual, silhouette_rows
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
 
@@ -186,6 +186,15 @@ class Correspondence:
     square: Float[Tensor, "batch parts num"]  # m^2; of other parts than these to first order
 
 
+@dataclass(frozen=True)
+class _Answer:
+    """The parts that answer for each point."""
+
+    part: Int[Tensor, "batch few num"]
+    weight: Float[Tensor, "batch few num"]
+    index: Int[Tensor, "batch 1 num"] | None  # of the one among the `Correspondence`'s; None: all of these
+
+
 @cache
 def compiling_works(device: str) -> bool:
     """Whether torch.compile can make code for this kind of device here; if not, one warning says why."""
@@ -311,46 +320,52 @@ class Registrar(nn.Module):
         rim: bool = True,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
         """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part."""
-        rows, support = self._point_rows(posed, foot, labelling.belief, observation.cloud)
+        answer = self._answer(foot, labelling.belief, observation.cloud)
+        rows = self._point_rows(posed, foot, answer, observation.cloud)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(
                 posed, observation.nearest, observation.camera, self.config.rim, observation.frame
             )
             # Rims of one part move together, so they count as a few independent measurements, not as many.
             rows = Rows.cat(rows, across)
-        return rows, support
+        return rows, self._support(posed, answer, observation.cloud)
 
-    def _point_row_count(self, cloud: PointCloud) -> int:
-        return 3 * cloud.mask.shape[1] * (1 if self.config.hard else self.body.num_parts)
-
-    def _point_rows(
-        self,
-        posed: PosedBody,
-        foot: Correspondence,
-        belief: Float[Tensor, "batch labels num"],
-        cloud: PointCloud,
-    ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """Three rows for each pair of point and part, all first coordinates first; and the points on each part.
-
-        In memory the coordinates stand before the pairs, so that every operation runs along the pairs.
-        """
-        config, K = self.config, self.body.num_parts
+    def _answer(
+        self, foot: Correspondence, belief: Float[Tensor, "batch labels num"], cloud: PointCloud
+    ) -> _Answer:
+        """Which parts answer for each point, and how far."""
         weight = belief.gather(1, foot.part)
-        feet = torch.cat([foot.foot.local, foot.foot.normal, foot.foot.residual], -1).mT  # (B, few, 9, N)
-        part = foot.part
-        if config.hard:
-            best, index = weight.max(1, keepdim=True)  # far faster than `argmax`
-            none = belief[:, K:].amax(1, keepdim=True) if belief.shape[1] > K else torch.zeros_like(best)
-            weight = ((best > none) & cloud.mask[:, None]).to(belief)
-            part = part.gather(1, index)
-            feet = feet.gather(1, index[:, :, None].expand(-1, -1, 9, -1))
-        target = cloud.points.mT.repeat(1, 1, part.shape[1])
-        part, weight, feet = part.flatten(1), weight.flatten(1), feet.transpose(1, 2).flatten(2)
+        if not self.config.hard:
+            return _Answer(foot.part, weight, None)
+        K = self.body.num_parts
+        best, index = weight.max(1, keepdim=True)  # far faster than `argmax`
+        none = belief[:, K:].amax(1, keepdim=True) if belief.shape[1] > K else torch.zeros_like(best)
+        weight = ((best > none) & cloud.mask[:, None]).to(belief)
+        return _Answer(foot.part.gather(1, index), weight, index)
+
+    def _support(self, posed: PosedBody, answer: _Answer, cloud: PointCloud) -> Float[Tensor, "batch parts"]:
+        """How many points speak for each part."""
+        K = self.body.num_parts
+        part, weight = answer.part.flatten(1), answer.weight.flatten(1)
+        target = cloud.points.mT.repeat(1, 1, answer.part.shape[1])
         # What a point says of a limb's direction grows with the square of its distance from the joint.
         joint = posed.origins[:, self.body.carriers[:K]].mT.gather(2, part[:, None].expand(-1, 3, -1))
         lever = (target - joint).square().sum(1)
-        far = (lever / config.rest_lever**2).clamp_max(1)
-        support = weight.new_zeros(len(part), K).scatter_add(1, part, weight * far)
+        far = (lever / self.config.rest_lever**2).clamp_max(1)
+        return weight.new_zeros(len(part), K).scatter_add(1, part, weight * far)
+
+    def _point_rows(self, posed: PosedBody, foot: Correspondence, answer: _Answer, cloud: PointCloud) -> Rows:
+        """Three rows for each pair of point and part, all first coordinates first.
+
+        In memory the coordinates stand before the pairs, so that every operation runs along the pairs.
+        """
+        config = self.config
+        feet = torch.cat([foot.foot.local, foot.foot.normal, foot.foot.residual], -1).mT  # (B, few, 9, N)
+        if answer.index is not None:
+            feet = feet.gather(1, answer.index[:, :, None].expand(-1, -1, 9, -1))
+        target = cloud.points.mT.repeat(1, 1, answer.part.shape[1])
+        part, weight = answer.part.flatten(1), answer.weight.flatten(1)
+        feet = feet.transpose(1, 2).flatten(2)
         local, normal, gap = feet.split(3, 1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
@@ -368,7 +383,7 @@ class Registrar(nn.Module):
         spread = (1 - config.tangential) * outer + config.tangential * eye  # (B, 3, 3, pairs), symmetric
         direction = (scale[:, None, None] * spread).flatten(2)
         local, target, direction = (x.mT for x in (local.repeat(1, 1, 3), target.repeat(1, 1, 3), direction))
-        return Rows(part.repeat(1, 3), local, target, direction, part.shape[1]), support
+        return Rows(part.repeat(1, 3), local, target, direction, part.shape[1])
 
     def with_rest(self, prior: PosePrior, support: Float[Tensor, "batch parts"]) -> PosePrior:
         """The prior, joined by a pull towards the rest pose on every joint below which little is seen."""
@@ -402,17 +417,23 @@ class Registrar(nn.Module):
         posed = self.body(pose, size) if posed is None else posed
         foot = self.correspond(posed, observation)
         labelling = self.label(posed, foot, observation, config.sigma_last)
-        rows, support = self.rows(posed, foot, labelling, observation)
-        full = self.with_rest(prior, support)
+        doubt = pose.new_tensor(torch.nan).expand(*pose.shape, pose.shape[1])
         if covariance:
+            rows, support = self.rows(posed, foot, labelling, observation)
+            full = self.with_rest(prior, support)
             equations = equations_by_moments(self.body, size, rows, full, config.fitting, posed)
             doubt = _inverse(equations.at(pose, posed)[2])
         else:
-            doubt = pose.new_tensor(torch.nan).expand(*pose.shape, pose.shape[1])
+            answer = self._answer(foot, labelling.belief, cloud)
+            full = self.with_rest(prior, self._support(posed, answer, cloud))
+        rims = pose.new_zeros(len(pose), 0)
+        if config.rim.weight > 0:
+            rims = silhouette_residual(
+                posed, observation.nearest, observation.camera, config.rim, observation.frame
+            )
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.foot.distance.amin(1) * cloud.mask
-        # Of the rows the points' come first; the bound stands in for them, with every label and none.
-        rims = rows.residual(posed)[:, self._point_row_count(cloud) :]
+        # The bound stands in for the points' rows, with every label and none.
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
         others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
         score = others - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
