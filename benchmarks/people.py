@@ -31,10 +31,11 @@ from torchpose.body.angle import anatomical_angles, limb_angles
 from torchpose.body.model import BodyModel
 from torchpose.cli import InferConfig, load_config
 from torchpose.eyes import Eyes, View
-from torchpose.people import People, PeopleWindows
+from torchpose.people import People
 from torchpose.pipeline import FramePose, StereoToPose
 from torchpose.recording import Backgrounds, Frame, Recording, open_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
+from torchpose.window import PeopleWindows
 
 ORACLES = ("disparity", "mask", "labels", "start", "size")
 KINDS = ("elbow", "knee", "shoulder", "hip")
@@ -250,7 +251,7 @@ def measure(
     if "size" in oracles:
         model.size = true_size(model.body, truth)
     results: list[FramePose] = []
-    windows = PeopleWindows(people)
+    windows = PeopleWindows(people.followers)
     begin = time.process_time()
     for position in range(min(len(recording), frames or len(recording))):
         frame = recording[position]

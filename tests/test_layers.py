@@ -68,7 +68,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
         *("export", "figures"),
-        *("eyes", "pipeline", "people", "session", "clips", "study", "cli"),
+        *("eyes", "pipeline", "window", "people", "session", "clips", "study", "cli"),
     ),
 }
 ORDER = [

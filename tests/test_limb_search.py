@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from synthetic_cloud import CAMERA, mirrored, see, standing
+from synthetic_cloud import CAMERA, mirrored, see, standing, together
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
@@ -46,7 +46,7 @@ def test_a_limb_that_was_put_elsewhere_is_found_again(scene, limb):
     low, high = body.low[own], body.high[own]
     moved[0, own] = torch.where(pose[0, own] - low > high - pose[0, own], low, high)
     assert worst_joint(body, moved, pose) > 0.4
-    found = search(observation, moved, size)
+    (found,) = search(observation, moved, size)
     assert found.shape == (4, 3, body.num_parameters)
     fitted = registrar(observation, found[limb], size, rounds=10, sigma_first=0.15)
     best = fitted.pose[fitted.score.argmin()][None]
@@ -58,7 +58,7 @@ def test_a_limb_that_was_put_elsewhere_is_found_again(scene, limb):
 
 def test_every_limb_is_sought_alone(scene):
     body, _, search, pose, observation = scene
-    found = search(observation, pose, body.default_size(1))
+    (found,) = search(observation, pose, body.default_size(1))
     for limb, own in enumerate(search.limbs):
         changed = (found[limb] != pose).any(0).nonzero()[:, 0]
         assert set(changed.tolist()) <= set(own.tolist())
@@ -78,10 +78,20 @@ def test_the_mirrored_scene_has_the_mirrored_limbs():
     other_pose[:, 0] *= -1  # it faces the camera: the rest is its own mirror image but for the limbs
     left, right = search.limbs[[0, 2]], search.limbs[[1, 3]]
     other_pose[:, left], other_pose[:, right] = pose[:, right], pose[:, left]
-    found = search(view.observation(), pose, size)
-    other = search(mirrored(view).observation(), other_pose, size)
+    (found,) = search(view.observation(), pose, size)
+    (other,) = search(mirrored(view).observation(), other_pose, size)
     for a, b in ((0, 1), (1, 0), (2, 3), (3, 2)):
         assert_close(other[b][:, search.limbs[b]], found[a][:, search.limbs[a]])
+
+
+def test_frames_searched_together_have_the_places_of_each_alone(scene):
+    body, _, search, pose, _ = scene
+    poses = torch.cat([pose, standing(body, x=0.3, yaw=-0.3), standing(body, z=3.5)])
+    sizes = torch.cat([body.size_of_height(height) for height in (1.6, 1.75, 1.9)])
+    views = [see(body, p[None], s[None]) for p, s in zip(poses, sizes, strict=True)]
+    found = search(together(views), poses, sizes)
+    for k, view in enumerate(views):
+        assert_close(found[k : k + 1], search(view.observation(), poses[k : k + 1], sizes[k : k + 1]))
 
 
 def test_points_that_are_not_numbers_still_give_places(scene):
@@ -89,7 +99,7 @@ def test_points_that_are_not_numbers_still_give_places(scene):
     points = torch.full_like(observation.cloud.points, torch.nan)
     broken = replace(observation, cloud=replace(observation.cloud, points=points))
     found = search(broken, pose, body.default_size(1))
-    assert found.shape == (4, 3, body.num_parameters)
+    assert found.shape == (1, 4, 3, body.num_parameters)
     assert found.isfinite().all()
 
 

@@ -11,7 +11,13 @@ from torch.testing import assert_close
 
 from torchpose.body.model import BodyConfig, BodyModel, JointKind
 from torchpose.registration.fitting import PosePrior, linearize_by_screws
-from torchpose.registration.silhouette import RimConfig, nearest_inside, overhang, silhouette_rows
+from torchpose.registration.silhouette import (
+    RimConfig,
+    nearest_inside,
+    overhang,
+    silhouette_residual,
+    silhouette_rows,
+)
 from torchpose.registration.vem import FittingConfig
 
 CONFIG = RimConfig()
@@ -187,6 +193,9 @@ def test_a_batch_equals_one_by_one(frame):
     shared = silhouette_rows(body(poses), nearest, CAMERA, CONFIG)
     for i in range(3):
         one = silhouette_rows(body(poses[i : i + 1]), masks[i : i + 1], CAMERA, CONFIG)
+        residual = silhouette_residual(body(poses), masks, CAMERA, CONFIG)[i : i + 1]
+        # The body's frames are square to single precision.
+        assert_close(residual, one.residual(body(poses[i : i + 1])), rtol=0, atol=1e-5)
         assert_close(batch.direction[i : i + 1], one.direction)
         assert_close(batch.target[i : i + 1], one.target)
     assert_close(shared.direction[0], batch.direction[0])

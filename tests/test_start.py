@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from synthetic_cloud import RELAXED, see, standing
+from synthetic_cloud import RELAXED, see, standing, together
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
@@ -97,6 +97,22 @@ def test_a_limb_that_is_elsewhere_is_found_by_a_refresh(body, starter, changes):
     assert found.score < stuck.score + 1
 
 
+def test_frames_refreshed_together_have_the_answers_of_each_alone(body, starter):
+    """Of different points, silhouettes, sizes and priors."""
+    poses = [standing(body, limbs(body, **WAVE), x=-0.4), standing(body, x=0.4, yaw=0.4)]
+    sizes = torch.cat([body.size_of_height(1.65), body.size_of_height(1.85)])
+    views = [see(body, pose, size[None], num=200) for pose, size in zip(poses, sizes, strict=True)]
+    start = torch.cat([standing(body, x=-0.38), standing(body, x=0.42, yaw=0.4)])
+    prior = PosePrior(start, torch.tensor([[1.0], [20.0]]).expand(2, 24))
+    both = starter.refresh(together(views), start, sizes, prior)
+    for k in range(2):
+        row = slice(k, k + 1)
+        own = PosePrior(start[row], prior.precision[row])
+        alone = starter.refresh(views[k].observation(), start[row], sizes[row], own)
+        for name in ("pose", "covariance", "score", "misfit", "distance"):
+            assert_close(getattr(both, name)[row], getattr(alone, name), rtol=1e-3, atol=1e-4)
+
+
 def test_a_refresh_weighs_its_answers_with_the_prior(body, starter):
     """Of a loose prior nothing is felt, a sure one is not left."""
     pose = standing(body, limbs(body, **WAVE))
@@ -146,19 +162,35 @@ def test_the_pelvis_is_guessed_within_an_eighth_of_a_metre(body, face):
 
 def test_exchanged_limbs_are_all_pairs_of_the_best(body, starter):
     poses = standing(body).repeat(10, 1)
-    poses[:, 6:] += torch.arange(10)[:, None] * 0.01
-    misfit = torch.tensor([9.0, 3, 8, 1, 7, 2, 6, 4, 5, 0])
-    combined = starter._exchange(poses, misfit, ("upper_arm", "forearm"))
+    poses[:, 6:] += torch.arange(10)[:, None] * 0.2
+    score = torch.tensor([9.0, 3, 8, 1, 7, 2, 6, 4, 5, 0])
+    (combined,), new = starter._exchange(poses[None], score[None], ("upper_arm", "forearm"))
     assert combined.shape == (64, 24)
+    assert new[0, 1:].all()
+    assert not new[0, 0]  # the best start itself
     left = body.parameter_names.index("forearm_left_1")
     right = body.parameter_names.index("upper_arm_right_2")
     pairs = {
         (round(a, 4), round(b, 4)) for a, b in (combined[:, [left, right]] - poses[0, [left, right]]).tolist()
     }
-    best = [round(0.01 * i, 4) for i in (9, 3, 5, 1, 7, 8, 6, 4)]
+    best = [round(0.2 * i, 4) for i in (9, 3, 5, 1, 7, 8, 6, 4)]
     assert pairs == {(a, b) for a in best for b in best}
     rest = [i for i, name in enumerate(body.parameter_names) if "arm" not in name]
     assert_close(combined[:, rest], poses[9, rest].expand(64, -1))
+
+
+def test_limbs_that_hardly_differ_from_those_of_better_starts_are_not_exchanged_again(body, starter):
+    """Of left arms at 0, 0.05, 0.15 and 0.02, that of the best start, one other is left; of equal right arms none."""
+    poses = standing(body).repeat(2, 4, 1)
+    left = [i for i, name in enumerate(body.parameter_names) if "arm_left" in name]
+    poses[0, :, left] += torch.tensor([0.0, 0.05, 0.15, 0.02])[:, None]
+    score = torch.tensor([3.0, 1.0, 2.0, 0.0]).expand(2, 4)
+    combined, new = starter._exchange(poses, score, ("upper_arm", "forearm"))
+    moved = combined[0, new[0]][:, left] - standing(body)[:, left]
+    assert_close(moved, torch.full((1, len(left)), 0.15))
+    assert not new[1].any()  # the other frame's starts are all alike
+    everything = Starter(body, replace(starter.config, apart=0.0), RegistrationConfig())
+    assert everything._exchange(poses, score, ("upper_arm", "forearm"))[1][:, 1:].all()
 
 
 def test_a_pose_turned_away_must_fit_better(body, starter):

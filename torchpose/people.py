@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 from torchpose.body.model import PosedBody
 from torchpose.export import JOINT_NAMES
 from torchpose.eyes import Sight, View
-from torchpose.pipeline import FramePose, SmoothingWindow, StereoToPose, upright_extent
+from torchpose.pipeline import FramePose, StereoToPose, upright_extent
 from torchpose.recording import Frame, Recording, UnreadableFrame
 from torchpose.registration.vem import Observation, Registration
 from torchpose.tracking.kalman import Gaussian
@@ -30,13 +30,14 @@ from torchpose.tracking.location import (
     sighting,
 )
 from torchpose.tracking.partition import PartitionConfig, split_people
-from torchpose.tracking.tracker import Person, TrackStatus, track_together
+from torchpose.tracking.tracker import Sought, TrackStatus, track_together
 from torchpose.vision.clump import ArtefactConfig, keep_points, person_points
 from torchpose.vision.colour_histogram import back_projection, colour_histogram, colour_similarity
 from torchpose.vision.faces import FaceMemory
 from torchpose.vision.head import HeadConfig, find_head
 from torchpose.vision.skin import SkinModel
 from torchpose.vision.trunk import TrunkConfig, find_trunk
+from torchpose.window import PeopleWindows
 
 WALK = 0.8  # s over which somebody's way is measured
 TOUCHING = 3  # px between somebody and what may hide a part
@@ -172,7 +173,7 @@ class People:
 
     def __call__(self, recording: Recording) -> Iterator[list[FramePose]]:
         """Smoothed poses of a prepared recording's frames, in order: those of everybody who was there so far."""
-        windows = PeopleWindows(self)
+        windows = PeopleWindows(self.followers)
         for position in range(len(recording)):
             yield from windows.push(self.step(recording, position))
         yield from windows.flush()
@@ -223,7 +224,7 @@ class People:
                     observation = follower.model.observe(sight, cover)
                 cut = sight is not None and (sight.cut or self._partly(body, cover))
                 asked.append(
-                    Person(
+                    Sought(
                         follower.model.tracker,
                         time_s,
                         observation,
@@ -489,7 +490,7 @@ class People:
         camera = self.model.camera
         return outside | covered[0, v.clamp(0, camera.height - 1), u.clamp(0, camera.width - 1)]
 
-    def _learn(self, follower: Follower, sight: Sight, person: Person, found: Registration) -> None:
+    def _learn(self, follower: Follower, sight: Sight, person: Sought, found: Registration) -> None:
         """The person's clothes, and the size from the first frames in which all of the person is seen."""
         if sight.coloured and not person.cut:
             now = colour_histogram(sight.images, sight.silhouette)
@@ -514,35 +515,6 @@ class People:
             follower.restore(state)
 
 
-class PeopleWindows:
-    """A smoothing window for each person, which fill and empty together."""
-
-    def __init__(self, people: People, states: Sequence[Mapping[str, Tensor]] | None = None):
-        self.people = people
-        self.windows: list[SmoothingWindow] = []
-        for k, follower in enumerate(people.followers):
-            self.windows.append(
-                SmoothingWindow(follower.model, states[k] if states else None, follower.state)
-            )
-
-    def push(self, poses: list[FramePose]) -> list[list[FramePose]]:
-        """Take the next frame of everybody; the frames that are ready, of everybody, often none."""
-        for k in range(len(self.windows), len(poses)):
-            follower = self.people.followers[k]
-            window = SmoothingWindow(follower.model, None, follower.state)
-            # Not pushed: of a time before somebody came there is no state to go on from.
-            window.waiting = [
-                replace(earlier, status=TrackStatus.absent, registration=None, sight=None, observation=None)
-                for earlier in self.windows[0].waiting
-            ]
-            self.windows.append(window)
-        return _by_frame([window.push(pose) for window, pose in zip(self.windows, poses, strict=True)])
-
-    def flush(self) -> list[list[FramePose]]:
-        """The frames that are left at the end of the recording."""
-        return _by_frame([window.flush() for window in self.windows])
-
-
 def _at_border(mask: Bool[Tensor, "height width"]) -> bool:
     """Whether somebody is cut by the image's sides, where people come in."""
     return bool(mask[:, :2].any() | mask[:, -2:].any())
@@ -551,10 +523,6 @@ def _at_border(mask: Bool[Tensor, "height width"]) -> bool:
 def _spread(place: Gaussian) -> Float[Tensor, " batch"]:
     """The greatest standard deviation of a place's coordinates, m."""
     return place.covariance.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
-
-
-def _by_frame(poses: list[list[FramePose]]) -> list[list[FramePose]]:
-    return [list(frame) for frame in zip(*poses, strict=True)]
 
 
 def _together(bodies: list[PosedBody]) -> PosedBody | None:

@@ -296,9 +296,12 @@ class StereoToPose(nn.Module):
         """Go on from a `state`."""
         self.size = state["size"].to(self.size)
         self.colour.counts = state["colours"].to(self.size)
-        for prefix, part in (("tracker_", self.tracker), ("eyes_", self.eyes)):
-            own = {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}
-            part.restore(own, self.device)
+        own = {
+            prefix: {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}
+            for prefix in ("tracker_", "eyes_")
+        }
+        self.tracker.restore(own["tracker_"])
+        self.eyes.restore(own["eyes_"], self.device)
 
     def sequence(self, frames: list[FramePose]) -> PoseSequence:
         """The frames' numbers, as they are written: NaN wherever there is no pose."""

@@ -35,11 +35,12 @@ from torchpose.export import (
 )
 from torchpose.eyes import depth_picture
 from torchpose.figures import Overlay, draw_overlay, plot_angles
-from torchpose.people import People, PeopleWindows
+from torchpose.people import People
 from torchpose.pipeline import FramePose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
 from torchpose.registration.size import write_size
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
+from torchpose.window import PeopleWindows
 
 CHECKED = 3  # frames whose rows are compared
 FEWEST = 5  # frames with a pose, from which somebody further is written
@@ -162,7 +163,7 @@ class Session:
 
     def _follow(self, done: int, count: int) -> None:
         """Frames `done` to `count`, saved whenever a stretch of them is smooth."""
-        windows = PeopleWindows(self.people, self.kept)
+        windows = PeopleWindows(self.people.followers, self.kept)
         with tqdm(
             total=count, initial=done, unit="frame", disable=not sys.stderr.isatty(), leave=False
         ) as bar:

@@ -4,7 +4,7 @@ The hierarchical step (T. 6.2.1): the root is known, the chains outward are soug
 radians.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchpose.body.ellipsoid import foot_point, rough_distance
 from torchpose.body.model import BodyModel, PosedBody
-from torchpose.registration.silhouette import silhouette_rows
+from torchpose.registration.silhouette import silhouette_residual
 from torchpose.registration.vem import Observation, Registrar
 
 # A limb is a body on the root that others hang from: its joint, and that of the body after it, have four parameters.
@@ -59,76 +59,81 @@ class LimbSearch(nn.Module):
     def forward(
         self,
         observation: Observation,
-        pose: Float[Tensor, "1 parameters"],
+        pose: Float[Tensor, "batch parameters"],
         size: Float[Tensor, "#batch sizes"],
-    ) -> Float[Tensor, "limbs best parameters"]:
-        """For each limb the best poses that differ from `pose` in that limb alone."""
-        L, C = self.places.shape[:2]
+    ) -> Float[Tensor, "batch limbs best parameters"]:
+        """For each frame and limb the best poses that differ from `pose` in that limb alone."""
+        B, (L, C) = len(pose), self.places.shape[:2]
         rest = self._rest_of_body(observation, pose, size)
-        poses = pose.expand(L, C, -1).scatter(2, self.limbs[:, None].expand(-1, C, -1), self.places)
-        score = self._score(observation, poses, size, rest, exact=False).nan_to_num(nan=-torch.inf)
-        short = score.topk(self.config.shortlist, 1).indices
-        poses = poses.gather(1, short[..., None].expand(-1, -1, poses.shape[2]))
-        score = self._score(observation, poses, size, rest, exact=True).nan_to_num(nan=-torch.inf)
+        places = self.places.expand(B, L, C, PARAMETERS)
+        score = self._score(observation, pose, places, size, rest, exact=False).nan_to_num(nan=-torch.inf)
+        short = score.topk(self.config.shortlist, 2).indices
+        places = places.gather(2, short[..., None].expand(-1, -1, -1, PARAMETERS))
+        score = self._score(observation, pose, places, size, rest, exact=True).nan_to_num(nan=-torch.inf)
         # The best ones of all are often one place several times.
-        places = poses.gather(2, self.limbs[:, None].expand(-1, poses.shape[1], -1))
         rank, best = score, []
         for _ in range(self.config.best):
-            best.append(rank.argmax(1))
-            gap = (places - places.gather(1, best[-1][:, None, None].expand(-1, 1, PARAMETERS))).abs().amax(2)
+            best.append(rank.argmax(2))
+            one = places.gather(2, best[-1][..., None, None].expand(-1, -1, 1, PARAMETERS))
             # Those beside it come last, in case there are no others.
-            rank = torch.where(gap < self.config.apart, rank - CLOSE, rank)
-            rank = rank.scatter(1, best[-1][:, None], -torch.inf)
-        index = torch.stack(best, 1)
-        return poses.gather(1, index[..., None].expand(-1, -1, poses.shape[2]))
+            rank = torch.where((places - one).abs().amax(3) < self.config.apart, rank - CLOSE, rank)
+            rank = rank.scatter(2, best[-1][..., None], -torch.inf)
+        index = torch.stack(best, 2)
+        chosen = places.gather(2, index[..., None].expand(-1, -1, -1, PARAMETERS))
+        poses = pose[:, None, None].expand(B, L, index.shape[2], -1)
+        return poses.scatter(3, self.limbs[:, None].expand_as(chosen), chosen)
 
     def _score(
         self,
         observation: Observation,
-        poses: Float[Tensor, "limbs candidates parameters"],
+        pose: Float[Tensor, "batch parameters"],
+        places: Float[Tensor, "batch limbs candidates 4"],
         size: Float[Tensor, "#batch sizes"],
-        rest: Float[Tensor, "limbs num"],
+        rest: Float[Tensor, "batch limbs num"],
         exact: bool,
-    ) -> Float[Tensor, "limbs candidates"]:
+    ) -> Float[Tensor, "batch limbs candidates"]:
         """Log-density of the points and of the rims, up to a constant for each limb."""
-        L, C = poses.shape[:2]
+        B, L, C = places.shape[:3]
         parts = torch.stack([own.nonzero()[:, 0] for own in self.own])  # (L, own parts)
-        limb = _only(self.body(poses.flatten(0, 1), size), parts.repeat_interleave(C, 0))
+        # A limb's parts hang on the root and on their own parameters alone: all limbs are moved at once.
+        moved = pose[:, None].repeat(1, C, 1)
+        moved[:, :, self.limbs] = places.transpose(1, 2)
+        sizes = size.expand(B, -1).repeat_interleave(C, 0)
+        limbs = _only(self.body(moved.flatten(0, 1), sizes), parts.flatten(), B)
         cloud, registrar = observation.cloud, self.registrar
         if exact:
-            points = cloud.points.expand(L * C, -1, -1)
-            square = (foot_point(limb, points, registrar.config.visible).residual ** 2).sum(-1)
+            square = foot_point(limbs, cloud.points, registrar.config.visible).residual.square().sum(-1)
         else:
-            square = rough_distance(limb, cloud.points, registrar.config.visible) ** 2
-        appearance = observation.potential.mT[0, parts].repeat_interleave(C, 0)
-        inside = (appearance - square / (2 * self.config.sigma**2)).logsumexp(1)
-        share = (registrar.config.effective_points / cloud.mask.sum().clamp_min(1)).clamp_max(1)
-        score = share * (torch.logaddexp(rest.repeat_interleave(C, 0), inside) * cloud.mask).sum(1)
+            square = rough_distance(limbs, cloud.points, registrar.config.visible).square()
+        square = square.unflatten(1, (C, *parts.shape))  # (B, C, L, own parts, N)
+        appearance = observation.potential.mT[:, None, parts]
+        inside = (appearance - square / (2 * self.config.sigma**2)).logsumexp(3)
+        mask = cloud.mask[:, None, None]
+        share = (registrar.config.effective_points / mask.sum(3).clamp_min(1)).clamp_max(1)
+        score = share * (torch.logaddexp(rest[:, None], inside) * mask).sum(3)
         if registrar.config.rim.weight > 0:
-            rows = silhouette_rows(limb, observation.nearest, observation.camera, registrar.config.rim)
-            score = score - 0.5 * rows.residual(limb).square().sum(1)
-        return score.unflatten(0, (L, C))
+            rims = silhouette_residual(
+                limbs, observation.nearest, observation.camera, registrar.config.rim, observation.frame
+            )
+            score = score - 0.5 * rims.square().unflatten(1, (C, L, -1)).sum(3)
+        return score.transpose(1, 2)
 
     def _rest_of_body(
         self, observation: Observation, pose: Tensor, size: Tensor
-    ) -> Float[Tensor, "limbs num"]:
+    ) -> Float[Tensor, "batch limbs num"]:
         """Log-density of each point by all parts but a limb's own, and by none."""
         posed = self.body(pose, size)
-        square = (
-            foot_point(posed, observation.cloud.points, self.registrar.config.visible).residual ** 2
-        ).sum(-1)
-        potential = observation.potential.mT - square / (2 * self.config.sigma**2)  # (1, parts, N)
-        potential = potential.masked_fill(self.own[:, :, None], -torch.inf)
-        none = torch.full_like(potential[:, :1], -0.5 * max(self.registrar.config.outlier, 3.0) ** 2)
-        return torch.cat([potential, none], 1).logsumexp(1)
+        square = foot_point(posed, observation.cloud.points, self.registrar.config.visible).residual.square()
+        potential = observation.potential.mT - square.sum(-1) / (2 * self.config.sigma**2)  # (B, parts, N)
+        potential = potential[:, None].masked_fill(self.own[:, :, None], -torch.inf)
+        none = torch.full_like(potential[:, :, :1], -0.5 * max(self.registrar.config.outlier, 3.0) ** 2)
+        return torch.cat([potential, none], 2).logsumexp(2)
 
 
-def _only(posed: PosedBody, parts: Int[Tensor, "batch own"]) -> PosedBody:
-    """A posed body with these ellipsoids alone."""
-    index = parts[..., None]
-    return replace(
-        posed,
-        centers=posed.centers.gather(1, index.expand(-1, -1, 3)),
-        frames=posed.frames.flatten(2).gather(1, index.expand(-1, -1, 9)).unflatten(2, (3, 3)),
-        radii=posed.radii.gather(1, index.expand(-1, -1, 3)),
-    )
+def _only(posed: PosedBody, parts: Int[Tensor, " own"], batch: int) -> PosedBody:
+    """These ellipsoids alone, of several posed bodies of each of `batch` frames as those of one body."""
+    every = len(posed.centers) // batch
+    one = {name: getattr(posed, name)[::every] for name in PosedBody.__dataclass_fields__}
+    for name in ("centers", "frames", "radii"):
+        one[name] = getattr(posed, name)[:, parts].unflatten(0, (batch, every)).flatten(1, 2)
+    return PosedBody(**one)

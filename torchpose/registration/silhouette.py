@@ -75,8 +75,33 @@ def silhouette_rows(
     B, K = posed.centers.shape[:2]
     points = outline(posed, config.rim_points)
     local = (points - posed.centers[:, :, None]) @ posed.frames
-    points, local = points.flatten(1, 2), local.flatten(1, 2)
     part = torch.arange(K, device=points.device).repeat_interleave(config.rim_points).expand(B, -1)
+    target, direction = _edge(points.flatten(1, 2), nearest, camera, config, frame)
+    return Rows(part, local.flatten(1, 2), target, direction)
+
+
+def silhouette_residual(
+    posed: PosedBody,
+    nearest: Float[Tensor, "masks height width 2"],
+    camera: StereoCamera,
+    config: RimConfig,
+    frame: Int[Tensor, " batch"] | None = None,
+) -> Float[Tensor, "batch rims"]:
+    """The residuals of the `silhouette_rows`, no unit, for those who need no more: twice as fast."""
+    points = outline(posed, config.rim_points).flatten(1, 2)
+    target, direction = _edge(points, nearest, camera, config, frame)
+    return (direction * (target - points)).sum(-1)
+
+
+def _edge(
+    points: Float[Tensor, "batch rims 3"],
+    nearest: Float[Tensor, "masks height width 2"],
+    camera: StereoCamera,
+    config: RimConfig,
+    frame: Int[Tensor, " batch"] | None,
+) -> tuple[Float[Tensor, "batch rims 3"], Float[Tensor, "batch rims 3"]]:
+    """Where the mask's edge draws each rim point, m, and the direction along which that counts, 1/m."""
+    B = len(points)
     depth = points[..., 2].clamp_min(0.1)
     pixel = camera.project(torch.cat([points[..., :2], depth[..., None]], -1))
     H, W = nearest.shape[1:3]
@@ -96,14 +121,14 @@ def silhouette_rows(
     metres = (length - MARGIN) * depth / camera.focal_length
     pull = (config.reach / metres.clamp_min(config.reach)) * (config.weight**0.5 / config.sd)
     target = camera.back_project(goal + MARGIN * unit, depth)
-    return Rows(part, local, target, across * (outside * pull)[..., None])
+    return target, across * (outside * pull)[..., None]
 
 
 def overhang(
     posed: PosedBody, nearest: Float[Tensor, "#batch height width 2"], camera: StereoCamera, config: RimConfig
 ) -> Float[Tensor, " batch"]:
     """How far the body's rims stand out of the mask, m: mean over the rim points, each at most `reach`."""
-    return overhang_of(silhouette_rows(posed, nearest, camera, config).residual(posed), config)
+    return overhang_of(silhouette_residual(posed, nearest, camera, config), config)
 
 
 def overhang_of(residual: Float[Tensor, "batch rims"], config: RimConfig) -> Float[Tensor, " batch"]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from math import cos, pi, radians, sin
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.body.model import BodyModel
@@ -50,6 +50,8 @@ class StartConfig:
     final_rounds: int = 8  # of the best few, on all points
     finalists: int = 4
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
+    exchanged: int = 8  # best starts whose limbs are exchanged
+    apart: float = 0.05  # rad by which limbs differ that are exchanged: the others end in the same place
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
     refresh_sigma: float = 0.05  # m, in a refresh's first round: all but a limb or two are right
@@ -61,9 +63,11 @@ class StartConfig:
     backwards_penalty: float = 15.0  # nats that a pose turned against the way somebody walks must make good
 
     def __post_init__(self) -> None:
-        for name in ("points", "rounds", "final_rounds", "finalists"):
+        for name in ("points", "rounds", "final_rounds", "finalists", "exchanged"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.apart < 0:
+            raise ValueError(f"apart must not be negative, got {self.apart}; 0 exchanges all limbs")
         if not (self.yaws and self.face_yaws and self.walking_yaws):
             raise ValueError("yaws, face_yaws and walking_yaws need at least one angle each, in degrees")
         if not (self.back_penalty >= 0 and self.backwards_penalty >= 0):
@@ -99,7 +103,7 @@ class Starter(nn.Module):
         """
         walking = None if bool(faces.found[0]) else walking
         starts = self.hypotheses(observation, faces, size, walking)
-        found = self._search(observation, starts, size, self.config.sigma, walking=walking)
+        found = self._search(observation, starts[None], size, self.config.sigma, walking=walking)
         for _ in range(self.config.refreshes):
             if float(found.misfit) < self.config.good_misfit:
                 break
@@ -112,46 +116,70 @@ class Starter(nn.Module):
     def refresh(
         self,
         observation: Observation,
-        pose: Float[Tensor, "1 parameters"],
+        pose: Float[Tensor, "batch parameters"],
         size: Float[Tensor, "#batch sizes"],
         prior: PosePrior | None = None,
         walking: float | None = None,
     ) -> Registration:
-        """Register one frame from a pose of which some limbs may be wrong: each limb is tried elsewhere too."""
+        """Register frames from poses of which some limbs may be wrong: each limb is tried elsewhere too."""
         few = thin(observation, self.config.points)
-        limbs = self.limb_search(few, pose, size)
+        limbs = self.limb_search(few, pose, size)  # (B, limbs, best, P)
         together = pose.clone()
-        for own, best in zip(self.limb_search.limbs, limbs[:, 0], strict=True):
-            together[:, own] = best[own]
-        starts = torch.cat([pose, together, limbs.flatten(0, 1)])
+        for k, own in enumerate(self.limb_search.limbs):
+            together[:, own] = limbs[:, k, 0, own]
+        starts = torch.cat([pose[:, None], together[:, None], limbs.flatten(1, 2)], 1)
         return self._search(observation, starts, size, self.config.refresh_sigma, prior, walking)
 
     def _search(
         self,
         observation: Observation,
-        starts: Float[Tensor, "starts parameters"],
+        starts: Float[Tensor, "batch starts parameters"],
         size: Float[Tensor, "#batch sizes"],
         sigma: float,
         prior: PosePrior | None = None,
         walking: float | None = None,
     ) -> Registration:
-        """Every start is fitted on a few points, the limbs of the good ones are exchanged in all pairs, and the best
-        few combinations are fitted on all points. The registration with the least misfit is returned."""
-        few = thin(observation, self.config.points)
-        rough = self.coarse(few, starts, size, _each(prior, len(starts)), self.config.rounds, sigma)
-        misfit = self.score(rough, walking)
-        arms = self._exchange(rough.pose, misfit, ("upper_arm", "forearm"))
-        legs = self._exchange(rough.pose, misfit, ("thigh", "shank"))
-        combined = torch.cat([rough.pose, arms, legs])
-        last = self.registrar.config.sigma_last
-        again = self.coarse(few, combined, size, _each(prior, len(combined)), 1, last)
-        best = (
-            self.score(again, walking).topk(min(self.config.finalists, len(combined)), largest=False).indices
+        """Every start of each frame is fitted on a few points, the limbs of the good ones are exchanged in all pairs,
+        and the best few combinations are fitted on all points. Of each frame the registration with the least misfit is
+        returned."""
+        few, (B, S, P) = thin(observation, self.config.points), starts.shape
+        row = torch.arange(B, device=starts.device)
+        every = row.repeat_interleave(S)
+        rough = self._fit(
+            self.coarse, few, every, starts.flatten(0, 1), size, prior, self.config.rounds, sigma
         )
-        final = self.registrar(
-            observation, again.pose[best], size, _each(prior, len(best)), self.config.final_rounds
-        )
-        return final.take(self.score(final, walking).argmin()[None])
+        pose, score = rough.pose.view(B, S, P), self.score(rough, walking).view(B, S)
+        arms, new_arms = self._exchange(pose, score, ("upper_arm", "forearm"))
+        legs, new_legs = self._exchange(pose, score, ("thigh", "shank"))
+        combined = torch.cat([pose, arms, legs], 1)
+        new = torch.cat([torch.ones_like(score, dtype=torch.bool), new_arms, new_legs], 1)
+        last, every = self.registrar.config.sigma_last, new.nonzero()[:, 0]
+        again = self._fit(self.coarse, few, every, combined[new], size, prior, 1, last)
+        rank = torch.full_like(combined[..., 0], torch.inf).masked_scatter(new, self.score(again, walking))
+        best = rank.topk(min(self.config.finalists, S), largest=False).indices
+        finalists = combined.masked_scatter(new[..., None], again.pose)
+        finalists = finalists.gather(1, best[..., None].expand(-1, -1, P)).flatten(0, 1)
+        every, rounds = row.repeat_interleave(best.shape[1]), self.config.final_rounds
+        final = self._fit(self.registrar, observation, every, finalists, size, prior, rounds, covariance=True)
+        return final.take(row * best.shape[1] + self.score(final, walking).view_as(best).argmin(1))
+
+    @staticmethod
+    def _fit(
+        registrar: Registrar,
+        observation: Observation,
+        frame: Int[Tensor, " rows"],
+        starts: Float[Tensor, "rows parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior | None,
+        rounds: int,
+        sigma: float | None = None,
+        covariance: bool = False,
+    ) -> Registration:
+        """Starts of several frames as one batch; `frame` is whose each is."""
+        if prior is not None:
+            prior = PosePrior(prior.mean[frame], prior.precision[frame])
+        sizes = size.expand(len(observation.potential), -1)[frame]
+        return registrar(observation.share(frame), starts, sizes, prior, rounds, sigma, covariance)
 
     def score(self, found: Registration, walking: float | None = None) -> Float[Tensor, " starts"]:
         """The registrations' scores with what the way the person faces costs, nats: less is better."""
@@ -192,22 +220,27 @@ class Starter(nn.Module):
 
     def _exchange(
         self,
-        pose: Float[Tensor, "starts parameters"],
-        misfit: Float[Tensor, " starts"],
+        pose: Float[Tensor, "batch starts parameters"],
+        score: Float[Tensor, "batch starts"],
         limb: tuple[str, str],
-    ) -> Float[Tensor, "combinations parameters"]:
-        """The best start with each left and each right limb of the eight best starts."""
+    ) -> tuple[Float[Tensor, "batch combinations parameters"], Bool[Tensor, "batch combinations"]]:
+        """The best start with each left and each right limb of the best starts; and which of these combinations are
+        no repetition: not that start itself, and of limbs that differ from those of all better starts."""
         names = self.body.parameter_names
-        sides = [
-            [i for i, name in enumerate(names) if name.startswith((limb[0] + side, limb[1] + side))]
-            for side in ("_left", "_right")
-        ]
-        order = misfit.argsort()[:8]
-        left, right = (part.flatten() for part in torch.meshgrid(order, order, indexing="ij"))
-        combined = pose[order[:1]].repeat(len(left), 1)
-        for index, chosen in zip(sides, (left, right), strict=True):
-            combined[:, index] = pose[chosen][:, index]
-        return combined
+        order = score.argsort(1)[:, : self.config.exchanged]
+        good = pose.gather(1, order[..., None].expand(-1, -1, pose.shape[2]))  # the best first
+        rank = torch.arange(good.shape[1], device=pose.device)
+        left, right = (part.flatten() for part in torch.meshgrid(rank, rank, indexing="ij"))
+        combined = good[:, :1].repeat(1, len(left), 1)
+        new = torch.ones_like(combined[..., 0], dtype=torch.bool)
+        for side, chosen in (("_left", left), ("_right", right)):
+            own = [i for i, name in enumerate(names) if name.startswith((limb[0] + side, limb[1] + side))]
+            limbs = good[..., own]
+            near = (limbs[:, :, None] - limbs[:, None]).abs().amax(3) < self.config.apart
+            combined[..., own] = limbs[:, chosen]
+            new &= ~near.tril(-1).any(2)[:, chosen]
+        new[:, 0] = False
+        return combined, new
 
     def turned_away(self, found: Registration) -> bool:
         """Whether a registration (batch 1) shows the person's back."""
@@ -240,13 +273,6 @@ def pelvis_position(
     x, z = torch.where(x.isfinite(), x, middle[:, 0]), torch.where(z.isfinite(), z, middle[:, 2])
     # The cloud is the body's front: the hips lie half a trunk's depth behind it.
     return torch.stack([x, y, z + 0.11], -1)
-
-
-def _each(prior: PosePrior | None, batch: int) -> PosePrior | None:
-    """The same prior for every start."""
-    return (
-        None if prior is None else PosePrior(prior.mean.expand(batch, -1), prior.precision.expand(batch, -1))
-    )
 
 
 def _directions(

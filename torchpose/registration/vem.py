@@ -34,7 +34,7 @@ from torchpose.registration.fitting import (
     pose_terms,
 )
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
-from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_rows
+from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_residual, silhouette_rows
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
 
@@ -147,7 +147,12 @@ class Observation:
         )
 
     def share(self, index: Tensor) -> "Observation":
-        """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames."""
+        """`take` without a copy of the silhouettes, which are by far the largest: for many rows of few frames.
+
+        Of a single frame, whose rows are all the same, nothing is copied.
+        """
+        if len(self.potential) == 1:
+            return self.expand(len(index))
         few = replace(self, nearest=self.nearest[:1]).take(index)
         return (
             few
@@ -202,6 +207,15 @@ class Correspondence:
     square: Float[Tensor, "batch parts num"]  # m^2; of other parts than these to first order
 
 
+@dataclass(frozen=True)
+class _Answer:
+    """The parts that answer for each point."""
+
+    part: Int[Tensor, "batch few num"]
+    weight: Float[Tensor, "batch few num"]
+    index: Int[Tensor, "batch 1 num"] | None  # of the one among the `Correspondence`'s; None: all of these
+
+
 @cache
 def compiling_works(device: str) -> bool:
     """Whether torch.compile can make code for this kind of device here; if not, one warning says why."""
@@ -233,22 +247,37 @@ class Registrar(nn.Module):
         prior: PosePrior | None = None,
         rounds: int | None = None,
         sigma_first: float | None = None,
+        covariance: bool = True,
     ) -> Registration:
         """Register from `start`. A row that is not finite keeps its start, with status NON_FINITE.
 
         Args:
             prior: what earlier frames say of the pose; None says nothing.
             rounds, sigma_first: override the config, for a cold start.
+            covariance: as for `evaluate`.
         """
-        config, B = self.config, start.shape[0]
-        observation = observation.expand(B)
         if prior is None:
             prior = PosePrior(start, torch.zeros_like(start))
+        solution, posed, bound = self.approach(observation, start, size, prior, rounds, sigma_first)
+        pose, status = solution.value, solution.status
+        return self.evaluate(observation, pose, size, prior, bound, status, posed, covariance)
+
+    def approach(
+        self,
+        observation: Observation,
+        start: Float[Tensor, "batch parameters"],
+        size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior,
+        rounds: int | None = None,
+        sigma_first: float | None = None,
+    ) -> tuple[Solution, PosedBody, Float[Tensor, "rounds batch"]]:
+        """The rounds of `forward` alone: the last M-step's answer, the body there, and the bound of each VE-step."""
+        config, B = self.config, start.shape[0]
+        observation = observation.expand(B)
         rounds = rounds or config.rounds
         sigma_first = sigma_first or config.sigma_first
         pose, bounds = start, []
         posed = self.body(pose, size)
-        status = torch.full((B,), int(Status.MAX_STEPS), device=start.device)
         for i in range(rounds):
             share = i / max(rounds - 1, 1)
             sigma = sigma_first ** (1 - share) * config.sigma_last**share
@@ -259,8 +288,8 @@ class Registrar(nn.Module):
             rows, support = self.rows(posed, foot, labelling, observation, rim)
             full = self.with_rest(prior, support)
             solution, posed = self.fit(pose, size, rows, full, posed)
-            pose, status = solution.value, solution.status
-        return self.evaluate(observation, pose, size, prior, torch.stack(bounds), status, posed)
+            pose = solution.value
+        return solution, posed, torch.stack(bounds)
 
     def fit(
         self,
@@ -330,48 +359,60 @@ class Registrar(nn.Module):
         `tangential` overrides the config.
         """
         tangential = self.config.tangential if tangential is None else tangential
-        rows, support = self._point_rows(posed, foot, labelling.belief, observation, tangential)
+        answer = self._answer(foot, labelling.belief, observation.cloud)
+        rows = self._point_rows(posed, foot, answer, observation, tangential)
         if rim and self.config.rim.weight > 0:
             across = silhouette_rows(
                 posed, observation.nearest, observation.camera, self.config.rim, observation.frame
             )
             # Rims of one part move together, so they count as a few independent measurements, not as many.
             rows = Rows.cat(rows, across)
-        return rows, support
+        return rows, self._support(posed, answer, observation.cloud)
 
-    def _point_row_count(self, cloud: PointCloud) -> int:
-        return 3 * cloud.mask.shape[1] * (1 if self.config.hard else self.body.num_parts)
+    def _answer(
+        self, foot: Correspondence, belief: Float[Tensor, "batch labels num"], cloud: PointCloud
+    ) -> _Answer:
+        """Which parts answer for each point, and how far."""
+        weight = belief.gather(1, foot.part)
+        if not self.config.hard:
+            return _Answer(foot.part, weight, None)
+        K = self.body.num_parts
+        best, index = weight.max(1, keepdim=True)  # far faster than `argmax`
+        none = belief[:, K:].amax(1, keepdim=True) if belief.shape[1] > K else torch.zeros_like(best)
+        weight = ((best > none) & cloud.mask[:, None]).to(belief)
+        return _Answer(foot.part.gather(1, index), weight, index)
+
+    def _support(self, posed: PosedBody, answer: _Answer, cloud: PointCloud) -> Float[Tensor, "batch parts"]:
+        """How many points speak for each part."""
+        K = self.body.num_parts
+        part, weight = answer.part.flatten(1), answer.weight.flatten(1)
+        target = cloud.points.mT.repeat(1, 1, answer.part.shape[1])
+        # What a point says of a limb's direction grows with the square of its distance from the joint.
+        joint = posed.origins[:, self.body.carriers[:K]].mT.gather(2, part[:, None].expand(-1, 3, -1))
+        lever = (target - joint).square().sum(1)
+        far = (lever / self.config.rest_lever**2).clamp_max(1)
+        return weight.new_zeros(len(part), K).scatter_add(1, part, weight * far)
 
     def _point_rows(
         self,
         posed: PosedBody,
         foot: Correspondence,
-        belief: Float[Tensor, "batch labels num"],
+        answer: _Answer,
         observation: Observation,
         tangential: float,
-    ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """Three rows for each pair of point and part, all first coordinates first; and the points on each part.
+    ) -> Rows:
+        """Three rows for each pair of point and part, all first coordinates first.
 
         In memory the coordinates stand before the pairs, so that every operation runs along the pairs.
         """
-        config, K, cloud = self.config, self.body.num_parts, observation.cloud
-        weight = belief.gather(1, foot.part)
+        config, cloud = self.config, observation.cloud
         square = foot.square.gather(1, foot.part)[..., None]
         feet = torch.cat([foot.foot.local, foot.foot.normal, square], -1).mT  # (B, few, 7, N)
-        part = foot.part
-        if config.hard:
-            best, index = weight.max(1, keepdim=True)  # far faster than `argmax`
-            none = belief[:, K:].amax(1, keepdim=True) if belief.shape[1] > K else torch.zeros_like(best)
-            weight = ((best > none) & cloud.mask[:, None]).to(belief)
-            part = part.gather(1, index)
-            feet = feet.gather(1, index[:, :, None].expand(-1, -1, 7, -1))
-        target = cloud.points.mT.repeat(1, 1, part.shape[1])
-        part, weight, feet = part.flatten(1), weight.flatten(1), feet.transpose(1, 2).flatten(2)
-        # What a point says of a limb's direction grows with the square of its distance from the joint.
-        joint = posed.origins[:, self.body.carriers[:K]].mT.gather(2, part[:, None].expand(-1, 3, -1))
-        lever = (target - joint).square().sum(1)
-        far = (lever / config.rest_lever**2).clamp_max(1)
-        support = weight.new_zeros(len(part), K).scatter_add(1, part, weight * far)
+        if answer.index is not None:
+            feet = feet.gather(1, answer.index[:, :, None].expand(-1, -1, 7, -1))
+        target = cloud.points.mT.repeat(1, 1, answer.part.shape[1])
+        part, weight = answer.part.flatten(1), answer.weight.flatten(1)
+        feet = feet.transpose(1, 2).flatten(2)
         local, normal, gap = feet.split((3, 3, 1), 1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
@@ -400,7 +441,7 @@ class Registrar(nn.Module):
             spread = spread - ((1 - trust) * ray)[:, :, None] * (ray[:, :, None] * spread).sum(1)[:, None]
         direction = (scale[:, None, None] * spread).flatten(2)
         local, target, direction = (x.mT for x in (local.repeat(1, 1, 3), target.repeat(1, 1, 3), direction))
-        return Rows(part.repeat(1, 3), local, target, direction, part.shape[1]), support
+        return Rows(part.repeat(1, 3), local, target, direction, part.shape[1])
 
     def with_rest(self, prior: PosePrior, support: Float[Tensor, "batch parts"]) -> PosePrior:
         """The prior, joined by a pull towards the rest pose on every joint below which little is seen."""
@@ -423,26 +464,35 @@ class Registrar(nn.Module):
         bound: Tensor,
         status: Tensor,
         posed: PosedBody | None = None,
+        covariance: bool = True,
     ) -> Registration:
-        """What speaks for a pose, with the body `posed` there if it is at hand."""
-        config, cloud = self.config, observation.cloud
+        """What speaks for a pose, with the body `posed` there if it is at hand.
+
+        Without `covariance` that is NaN: half of the time, for those who compare many poses.
+        """
+        config, observation = self.config, observation.expand(len(pose))
+        cloud = observation.cloud
         posed = self.body(pose, size) if posed is None else posed
         foot = self.correspond(posed, observation)
         labelling = self.label(posed, foot, observation, config.sigma_last)
-        rows, support = self.rows(posed, foot, labelling, observation)
-        full = self.with_rest(prior, support)
-        equations = equations_by_moments(self.body, size, rows, full, config.fitting, posed)
-        _, _, information = equations.at(pose, posed)
-        factor, failed = torch.linalg.cholesky_ex(information)
-        known = (failed == 0)[:, None, None]
-        # cholesky_inverse raises for the whole batch where one factor is singular.
-        eye = torch.eye(pose.shape[1], dtype=pose.dtype, device=pose.device)
-        covariance = torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
+        doubt = pose.new_tensor(torch.nan).expand(*pose.shape, pose.shape[1])
+        if covariance:
+            rows, support = self.rows(posed, foot, labelling, observation)
+            full = self.with_rest(prior, support)
+            equations = equations_by_moments(self.body, size, rows, full, config.fitting, posed)
+            doubt = _inverse(equations.at(pose, posed)[2])
+        else:
+            answer = self._answer(foot, labelling.belief, cloud)
+            full = self.with_rest(prior, self._support(posed, answer, cloud))
+        rims = pose.new_zeros(len(pose), 0)
+        if config.rim.weight > 0:
+            rims = silhouette_residual(
+                posed, observation.nearest, observation.camera, config.rim, observation.frame
+            )
         count = cloud.mask.sum(1).clamp_min(1)
         nearest = foot.foot.distance.amin(1) * cloud.mask
         fit = foot.square.gather(1, foot.part).amin(1).clamp_min(0).sqrt() * cloud.mask
-        # Of the rows the points' come first; the bound stands in for them, with every label and none.
-        rims = rows.residual(posed)[:, self._point_row_count(cloud) :]
+        # The bound stands in for the points' rows, with every label and none.
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
         others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
         score = others - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
@@ -450,8 +500,19 @@ class Registrar(nn.Module):
         if config.rim.weight > 0:
             misfit = misfit + overhang_of(rims, config.rim)
         return Registration(
-            pose, covariance, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
+            pose, doubt, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
         )
+
+
+def _inverse(
+    information: Float[Tensor, "batch parameters parameters"],
+) -> Float[Tensor, "batch parameters parameters"]:
+    """Of symmetric matrices; infinite where one is not positive definite."""
+    factor, failed = torch.linalg.cholesky_ex(information)
+    known = (failed == 0)[:, None, None]
+    # cholesky_inverse raises for the whole batch where one factor is singular.
+    eye = torch.eye(information.shape[1], dtype=information.dtype, device=information.device)
+    return torch.where(known, torch.cholesky_inverse(torch.where(known, factor, eye)), torch.inf)
 
 
 def stack_registrations(found: Sequence[Registration]) -> Registration:

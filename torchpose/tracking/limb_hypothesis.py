@@ -193,7 +193,9 @@ class _Work:
         for t, p in zip(frame.split(MOST), pose.split(MOST), strict=True) if len(frame) else ():
             nothing = PosePrior(p, torch.zeros_like(p))
             bound = p.new_zeros(1, len(p))
-            found = registrar.evaluate(self.seen(t, p), p, self.size[t], nothing, bound, bound[0].long())
+            found = registrar.evaluate(
+                self.seen(t, p), p, self.size[t], nothing, bound, bound[0].long(), covariance=False
+            )
             out.append(self._score(found))
         return torch.cat(out) if out else pose.new_zeros(0)
 
@@ -221,7 +223,7 @@ class _Work:
         place = pose.new_full((T, L, best, 4), torch.nan)
         for t in range(self.of.config.every // 2, T, self.of.config.every):
             one = torch.tensor([t], device=pose.device)
-            found = self.of.search(self.observation.take(one), pose[one], self.size[one])  # (L, best, P)
+            (found,) = self.of.search(self.observation.take(one), pose[one], self.size[one])  # (L, best, P)
             place[t] = found.gather(2, self.limbs[:, None].expand(-1, best, -1))
         return place
 
@@ -276,10 +278,10 @@ class _Work:
             zip(frame.split(MOST), limb.split(MOST), start.split(MOST), strict=True) if len(frame) else ()
         ):
             hold = torch.full_like(p, HELD).scatter(1, self.limbs[k], 0.0)
-            found = self.of.registrar(
+            found, _, _ = self.of.registrar.approach(
                 self.seen(t, p), p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
             )
-            out.append(torch.where(found.pose.isfinite().all(1, keepdim=True), found.pose, p))
+            out.append(torch.where(found.value.isfinite().all(1, keepdim=True), found.value, p))
         return torch.cat(out) if out else start
 
     def again(

@@ -1,4 +1,4 @@
-"""One person through a recording: prediction, registration, loss and recovery, frame after frame.
+"""People through a recording: prediction, registration, loss and recovery, frame after frame.
 
 Times are in seconds, poses in metres and radians. The next frame starts from the last (T. 3.2.2), and its root from
 where the person's location is believed to be (T. 4.3.1).
@@ -122,7 +122,7 @@ class Tracker(nn.Module):
             poses["velocity"] = self._velocity
         return poses | {name: torch.tensor(value, dtype=torch.float64) for name, value in memory.items()}
 
-    def restore(self, state: Mapping[str, Tensor], device: torch.device | None = None) -> None:
+    def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from a `state`; poses go to where the body is."""
         self.forget()
         if "failed" in state:
@@ -157,7 +157,7 @@ class Tracker(nn.Module):
             root: the middle of the hips as the person's location has it, m, batch 1; None where nothing is known.
             walking: yaw of the way that the person walks, rad; None for whoever stands, or nobody knows.
         """
-        return track_together([Person(self, time_s, observation, faces, size, cut, root, walking)])[0]
+        return track_together([Sought(self, time_s, observation, faces, size, cut, root, walking)])[0]
 
     def expect(self, time_s: float, root: Gaussian | None = None) -> Expected | None:
         """Where the pose is at `time_s`, and how surely, as earlier frames and the location have it.
@@ -183,7 +183,7 @@ class Tracker(nn.Module):
             precision = torch.cat([held + own, precision[:, 3:]], 1)
         return Expected(torch.cat([predicted, self._pose]), PosePrior(predicted, precision))
 
-    def begin_frame(self, person: "Person") -> TrackedFrame | Expected:
+    def begin_frame(self, person: "Sought") -> TrackedFrame | Expected:
         """The answer where none needs a registration, or where to register from."""
         if self._pose is not None and person.time_s - self._time > self.config.memory:
             self.forget()
@@ -201,45 +201,47 @@ class Tracker(nn.Module):
         self._remember(found, person.time_s)
         return TrackedFrame(TrackStatus.partial if person.cut else TrackStatus.tracked, found)
 
-    def end_frame(self, person: "Person", found: Registration, prior: PosePrior) -> TrackedFrame:
-        """The answer, from a registration: limbs are sought elsewhere where need be, and all of it if that fails."""
-        assert person.observation is not None
-        assert person.faces is not None
-        time_s, observation, size = person.time_s, person.observation, person.size
-        status = TrackStatus.partial if person.cut else TrackStatus.tracked
+    def seeks_limbs(self, person: "Sought", found: Registration) -> bool:
+        """Whether limbs are to be sought elsewhere than a registration has them."""
         stray = self._stray(found)
         # Points that stayed without a part after a search (a bag, a skirt) are no reason for another one at once.
         strayed = stray > max(self.config.stray_share, 1.5 * self._known_stray)
-        if strayed or not self.acceptable(found) or time_s - self._looked >= self.config.look_around:
-            self._looked = time_s
-            # First the limbs: where one moved too fast to follow, it is elsewhere.
-            loose = PosePrior(prior.mean, prior.precision / self.config.search_slack**2)
-            better = self.starter.refresh(observation, found.pose, size, loose)
-            if bool(is_finite(better)[0]) and bool(better.score < found.score):
-                found = better
+        look = person.time_s - self._looked >= self.config.look_around
+        if strayed or look or not self.acceptable(found):
+            return True
+        self._known_stray = min(self._known_stray, stray)
+        return False
+
+    def end_frame(self, person: "Sought", found: Registration, other: Registration | None) -> TrackedFrame:
+        """The answer, from a registration, and from the `other` one if limbs were sought: where a limb moved too fast
+        to follow, it is elsewhere. All of the body is sought if both fail."""
+        assert person.observation is not None
+        assert person.faces is not None
+        status = TrackStatus.partial if person.cut else TrackStatus.tracked
+        if other is not None:
+            self._looked = person.time_s
+            if bool(is_finite(other)[0]) and bool(other.score < found.score):
+                found = other
             self._known_stray = self._stray(found)
-        else:
-            self._known_stray = min(self._known_stray, stray)
         face = bool(person.faces.found[0])
-        if person.walking is not None and not face and self._against(found, person.walking, time_s):
-            self._turned = time_s
-            anew = self.starter(observation, person.faces, size, person.walking)
+        if person.walking is not None and not face and self._against(found, person.walking, person.time_s):
+            anew = self.starter(person.observation, person.faces, person.size, person.walking)
             scores = [float(self.starter.score(one, person.walking)) for one in (found, anew)]
             if self.acceptable(anew) and scores[1] < scores[0]:
                 found, status = anew, TrackStatus.recovered
                 self.forget()
-                self._turned = time_s
+            self._turned = person.time_s
         # Without colours the way that the person faces is given at the start, not measured: none turns away unseen.
         # Whose face is seen does not turn away either.
         away = self.starter.turned_away(found) and (face or not person.faces.sought)
         if not self.acceptable(found) or away:
-            anew = self.starter(observation, person.faces, size, person.walking)
+            anew = self.starter(person.observation, person.faces, person.size, person.walking)
             if self.acceptable(anew):
                 found, status = anew, TrackStatus.recovered
                 self.forget()  # the way here from the last pose is a jump, no velocity
         if not self.acceptable(found):
             return TrackedFrame(TrackStatus.lost, None)
-        self._remember(found, time_s)
+        self._remember(found, person.time_s)
         return TrackedFrame(status, found)
 
     def _against(self, found: Registration, walking: float, time_s: float) -> bool:
@@ -265,8 +267,8 @@ class Tracker(nn.Module):
 
 
 @dataclass(frozen=True)
-class Person:
-    """What a tracker is asked of one person in one frame; see `Tracker.forward`."""
+class Sought:
+    """Whom a tracker is to find in one frame; see `Tracker.forward`."""
 
     tracker: Tracker
     time_s: float
@@ -278,10 +280,10 @@ class Person:
     walking: float | None = None
 
 
-def track_together(people: Sequence[Person]) -> list[TrackedFrame]:
-    """The answers for several people in one frame, who are registered as one batch.
+def track_together(people: Sequence[Sought]) -> list[TrackedFrame]:
+    """The answers for several people in one frame, who are registered, and whose limbs are sought, as one batch.
 
-    They must share body and settings. Searches for limbs and cold starts, which some need, are each person's own.
+    They must share body and settings. A cold start, which few need, is each person's own.
     """
     begun = [person.tracker.begin_frame(person) for person in people]
     going = [
@@ -291,28 +293,36 @@ def track_together(people: Sequence[Person]) -> list[TrackedFrame]:
     ]
     if not going:
         return [answer for answer in begun if isinstance(answer, TrackedFrame)]
-    # From the prediction and from the last pose; what fits better is kept.
-    twice = torch.arange(len(going)).repeat_interleave(2)
-    observation = going[0][2]  # which serves any number of starts
-    if len(going) > 1:
-        observation = stack_observations([observation for _, _, observation in going]).take(twice)
+    one = going[0][0].tracker
+    observation = stack_observations([observation for _, _, observation in going])
+    size = torch.cat([person.size for person, _, _ in going])
     prior = PosePrior(
-        torch.cat([expected.prior.mean for _, expected, _ in going])[twice],
-        torch.cat([expected.prior.precision for _, expected, _ in going])[twice],
+        torch.cat([expected.prior.mean for _, expected, _ in going]),
+        torch.cat([expected.prior.precision for _, expected, _ in going]),
     )
-    both = going[0][0].tracker.registrar(
-        observation,
+    # From the prediction and from the last pose; what fits better is kept.
+    rows = torch.arange(len(going), device=size.device)
+    twice = rows.repeat_interleave(2)
+    both = one.registrar(
+        observation.share(twice),
         torch.cat([expected.starts for _, expected, _ in going]),
-        torch.cat([person.size for person, _, _ in going])[twice],
-        prior,
+        size[twice],
+        PosePrior(prior.mean[twice], prior.precision[twice]),
     )
     best = both.score.nan_to_num(nan=torch.inf).view(-1, 2).argmin(1)
-    found = both.take(2 * torch.arange(len(best), device=best.device) + best)
-    rows = iter(range(len(going)))
-    answers = []
-    for person, answer in zip(people, begun, strict=True):
-        if isinstance(answer, Expected):
-            one = found.take(torch.tensor([next(rows)], device=best.device))
-            answer = person.tracker.end_frame(person, one, answer.prior)
-        answers.append(answer)
-    return answers
+    found = [both.take(2 * row + which) for row, which in zip(rows.split(1), best.split(1), strict=True)]
+    seeking = [k for k, (person, _, _) in enumerate(going) if person.tracker.seeks_limbs(person, found[k])]
+    others: dict[int, Registration] = {}
+    if seeking:
+        some = rows[seeking]
+        refreshed = one.starter.refresh(
+            observation if len(seeking) == len(going) else observation.take(some),
+            torch.cat([found[k].pose for k in seeking]),
+            size[some],
+            PosePrior(prior.mean[some], prior.precision[some] / one.config.search_slack**2),
+        )
+        others = {k: refreshed.take(rows[i : i + 1]) for i, k in enumerate(seeking)}
+    ended = iter(
+        [person.tracker.end_frame(person, found[k], others.get(k)) for k, (person, _, _) in enumerate(going)]
+    )
+    return [next(ended) if isinstance(answer, Expected) else answer for answer in begun]
