@@ -8,9 +8,8 @@ import torch
 from hmmlearn.hmm import CategoricalHMM
 from torch.testing import assert_close
 
-from torchpose.activity.hmm import (
+from torchpose.activity.baum_welch import (
     MISSING,
-    DiscreteHMM,
     HMMConfig,
     Parameters,
     Status,
@@ -20,6 +19,7 @@ from torchpose.activity.hmm import (
     equal_segments,
     mask_padding,
 )
+from torchpose.activity.hmm import DiscreteHMM
 from torchpose.activity.inference import hmm_backward, hmm_filter, hmm_smoother, viterbi
 
 NO_SMOOTHING = {"emission_prior": 1.0, "transition_prior": 1.0}

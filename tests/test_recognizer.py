@@ -8,10 +8,10 @@ import torch
 from safetensors.torch import save_file
 from torch.testing import assert_close
 
+from torchpose.activity.baum_welch import HMMConfig, Status, Topology
 from torchpose.activity.codebook import CodebookConfig, CodebookStart
 from torchpose.activity.dataset import Clip, Split, read_skeletons, split_clips
 from torchpose.activity.features import FeatureConfig, FeatureKind
-from torchpose.activity.hmm import HMMConfig, Status, Topology
 from torchpose.activity.recognizer import NO_ACTIVITY, Answer, Evaluation, Recognizer, RecognizerConfig
 from torchpose.activity.subspace import Crop, SilhouetteConfig
 from torchpose.settings import compose_config

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.activity.hmm import MISSING
+from torchpose.activity.baum_welch import MISSING
 
 
 class CodebookStart(Enum):

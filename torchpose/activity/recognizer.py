@@ -18,10 +18,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from torchpose.activity.baum_welch import MISSING, BaumWelch, HMMConfig, Status
 from torchpose.activity.codebook import Codebook, CodebookConfig
 from torchpose.activity.dataset import Clip
 from torchpose.activity.features import FeatureConfig, build_feature
-from torchpose.activity.hmm import MISSING, BaumWelch, DiscreteHMM, HMMConfig, Status
+from torchpose.activity.hmm import DiscreteHMM
 from torchpose.atomic import replacing
 from torchpose.settings import compose_config
 
