@@ -162,6 +162,7 @@ class Codebook(nn.Module):
     mean: Float[Tensor, " features"]
     scale: Float[Tensor, " features"]
     centers: Float[Tensor, "symbols features"]
+    distortion: Float[Tensor, ""]  # mean squared distance of a training point from its code vector
 
     def __init__(self, config: CodebookConfig = CodebookConfig()) -> None:
         super().__init__()
@@ -169,6 +170,7 @@ class Codebook(nn.Module):
         self.register_buffer("mean", torch.empty(0))
         self.register_buffer("scale", torch.empty(0))
         self.register_buffer("centers", torch.empty(0, 0))
+        self.register_buffer("distortion", torch.zeros(()))
 
     def fit(
         self, features: Float[Tensor, "points features"], generator: torch.Generator | None = None
@@ -214,8 +216,17 @@ class Codebook(nn.Module):
                 ),
                 key=lambda fitted: float(fitted.inertia),
             )
-        self.centers = best.centers
+        self.centers, self.distortion = best.centers, best.inertia / len(points)
         return best
+
+    def certainty(self, deviation: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch"]:
+        """How far symbols can be trusted, in [0, 1], from their features' standard deviations; NaN is not known: 0.
+
+        q / (q + s), with q the distortion that the codebook itself brings and s the expected squared error. At s = q,
+        noise moves a point as far as quantising does, which is about as often to another symbol as not.
+        """
+        error = (deviation / self.scale).nan_to_num(nan=0.0).square().sum(-1)
+        return torch.where(error > 0, self.distortion / (self.distortion + error), 1.0)
 
     def forward(self, features: Float[Tensor, "*batch features"]) -> Int[Tensor, "*batch"]:
         """The symbol of each feature vector, in [0, V); -1 where a feature is NaN."""
