@@ -145,6 +145,28 @@ def test_pca_gives_no_more_components_than_the_images_span(images, pixels, dtype
     assert_close(centered @ fitted.components.T @ fitted.components, centered, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("fall", [0.99, 0.999])
+def test_few_components_of_large_images_reconstruct_as_well_as_the_exact_ones(fall, dtype):
+    """The error is that of LAPACK's decomposition to 5e-4, with a steep and a flat spectrum."""
+    images = torch.randn(1200, 1000) * fall ** torch.arange(1000)
+    images = (images @ torch.linalg.qr(torch.randn(1000, 1000)).Q + 3).to(dtype)
+    found = pca(images, 60)
+    exact = images.double() - images.double().mean(0)
+    rows = found.components.double()
+    assert_close(rows @ rows.T, torch.eye(60).double(), rtol=0, atol=1e-4)
+    error = (exact - exact @ rows.T @ rows).square().sum()
+    least = torch.linalg.svdvals(exact)[60:].square().sum()
+    assert least * (1 - 1e-6) <= error <= least * (1 + 5e-4)
+    assert_close(found.variance.double(), (exact @ rows.T).square().mean(0), rtol=1e-3, atol=0)
+    assert torch.equal(found.components, pca(images, 60).components)
+
+
+def test_large_images_that_span_little_have_few_components():
+    images = torch.randn(1100, 7, dtype=torch.float64) @ torch.randn(7, 1050, dtype=torch.float64)
+    assert pca(images, 100).components.shape == (7, 1050)
+
+
 def test_pca_of_silhouettes_that_leave_most_pixels_alone():
     """Single precision LAPACK did not converge on this covariance: most of its eigenvalues are 0."""
     draw = torch.Generator().manual_seed(9)
