@@ -7,9 +7,10 @@ capsules and shrunk to 48 x 64 px, single precision, as `torchpose.activity.feat
 
 pca       7200 images of 3072 pixels to 150 components. scikit-learn's defaults, which here are a randomized solver, and
           its exact one by the covariance matrix. `quality` is the squared error of the images put together again from
-          their components, over that of the exact decomposition in double precision; `differs` is how far above 1 it is.
-ica       150 component images of 3072 pixels to as many independent ones by symmetric FastICA with tanh, 100 rounds and no
-          tolerance from the same start. `quality` is the mean of log cosh, over scikit-learn's: FastICA's own objective.
+          their components, over that of the exact decomposition in double precision.
+ica       150 component images of 3072 pixels to as many independent ones by symmetric FastICA with tanh, 100 rounds and
+          no tolerance from the same start, after which neither has converged. `quality` is FastICA's own objective, how
+          far the mean of log cosh is from a normal distribution's, over scikit-learn's: more is better.
 kmeans    64 code vectors of 6000 frames of 30 features, from the same start to convergence (`lloyd`), and from an own
           start by k-means++ with 3 restarts (`plus plus`). `quality` is the inertia, over scikit-learn's.
 """

@@ -64,7 +64,9 @@ def nearest(
 ) -> Int[Tensor, "*batch"]:
     """The nearest centre of each point, by |c|^2 - 2 x.c: one matrix product, no (N, V, F) differences."""
     half_norm = centers.square().sum(1) / 2
-    return (half_norm - points @ centers.T).argmin(-1)
+    # `addmm` fills one matrix instead of two, which is most of the time.
+    distance = torch.addmm(half_norm, points.reshape(-1, points.shape[-1]), centers.T, alpha=-1)
+    return distance.argmin(-1).view(points.shape[:-1])
 
 
 def _squared_distance(points: Tensor, centers: Tensor, symbols: Tensor) -> Float[Tensor, " points"]:

@@ -215,9 +215,9 @@ class DiscreteHMM(nn.Module):
             )
         streams = self.log_emission.shape[1:-2]
         if symbols.shape[2:] != streams:
+            shape = ", ".join(["sequences", "time", *map(str, streams)])
             raise ValueError(
-                f"symbols must have the shape (sequences, time, {', '.join(map(str, streams))}) of the bank's streams, "
-                f"got {tuple(symbols.shape)}"
+                f"symbols must have the shape ({shape}) of the bank's streams, got {tuple(symbols.shape)}"
             )
         masked = mask_padding(symbols, lengths)
         if ((masked < MISSING) | (masked >= self.num_symbols)).any():

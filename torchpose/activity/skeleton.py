@@ -4,7 +4,9 @@ Positions in m, in any frame, right- or left-handed; directions do not depend on
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
+from functools import lru_cache
+from types import MappingProxyType
 
 import torch
 from jaxtyping import Float
@@ -47,7 +49,8 @@ _PAIRS = (
 )
 
 
-def joint_index(names: Sequence[str]) -> dict[str, int]:
+@lru_cache
+def joint_index(names: tuple[str, ...]) -> Mapping[str, int]:
     """Where each joint stands, by this package's names: `left_elbow`, `elbow_left` and `LeftElbow` are one.
 
     Raises:
@@ -68,11 +71,11 @@ def joint_index(names: Sequence[str]) -> dict[str, int]:
             f"a skeleton needs both shoulders and both hips, but {', '.join(missing)} cannot be found in "
             f"joint_names {', '.join(names)}"
         )
-    return index
+    return MappingProxyType(index)  # shared by all who ask
 
 
 def trunk_frame(
-    joints: Float[Tensor, "time joints 3"], index: dict[str, int], upright: bool
+    joints: Float[Tensor, "time joints 3"], index: Mapping[str, int], upright: bool
 ) -> Float[Tensor, "time 3 3"]:
     """Axes of the body in the columns: x to the left, y down, z = x cross y. Orthonormal.
 
@@ -94,7 +97,7 @@ def trunk_frame(
 
 
 def bone_directions(
-    joints: Float[Tensor, "time joints 3"], names: Sequence[str], upright: bool = False
+    joints: Float[Tensor, "time joints 3"], names: tuple[str, ...], upright: bool = False
 ) -> Float[Tensor, "time bones 3"]:
     """Unit vectors along the bones, in the body's frame: those of `BONES` whose ends are among the names.
 
@@ -112,7 +115,7 @@ def bone_directions(
 
 
 def joint_places(
-    joints: Float[Tensor, "time joints 3"], names: Sequence[str], upright: bool = False
+    joints: Float[Tensor, "time joints 3"], names: tuple[str, ...], upright: bool = False
 ) -> Float[Tensor, "time places 3"]:
     """Head, shoulders, elbows, wrists, knees and ankles from the middle of the hips, in the body's frame.
 
@@ -123,7 +126,7 @@ def joint_places(
 
 
 def arm_places(
-    joints: Float[Tensor, "time joints 3"], names: Sequence[str], upright: bool = False
+    joints: Float[Tensor, "time joints 3"], names: tuple[str, ...], upright: bool = False
 ) -> Float[Tensor, "time places 3"]:
     """Wrists and elbows from the middle of the shoulders, in the body's frame: the arms alone, however one bends."""
     index = joint_index(names)
@@ -131,7 +134,7 @@ def arm_places(
 
 
 def joint_distances(
-    joints: Float[Tensor, "time joints 3"], names: Sequence[str]
+    joints: Float[Tensor, "time joints 3"], names: tuple[str, ...]
 ) -> Float[Tensor, "time pairs"]:
     """Between the hands, from them to head, shoulder, hip and knee, and from the hips to head and feet."""
     index = joint_index(names)
@@ -140,7 +143,7 @@ def joint_distances(
     return torch.linalg.vector_norm(apart, dim=2) / _trunk_length(joints, index)
 
 
-def travel(joints: Float[Tensor, "time joints 3"], names: Sequence[str]) -> Float[Tensor, "time 3"]:
+def travel(joints: Float[Tensor, "time joints 3"], names: tuple[str, ...]) -> Float[Tensor, "time 3"]:
     """Since the first frame that was seen: how far the hips went over the ground, how far they rose, and the head.
 
     The vertical is the data's second axis, up where the shoulders are; without a head the shoulders stand for it.
@@ -157,7 +160,7 @@ def travel(joints: Float[Tensor, "time joints 3"], names: Sequence[str]) -> Floa
 
 
 def mirror_joints(
-    joints: Float[Tensor, "time joints 3"], names: Sequence[str]
+    joints: Float[Tensor, "time joints 3"], names: tuple[str, ...]
 ) -> Float[Tensor, "time joints 3"]:
     """The same done with the other side: left and right change places, and so do the ends of the first axis."""
     position = {_words(name): number for number, name in enumerate(names)}
@@ -173,18 +176,18 @@ def _words(name: str) -> tuple[str, ...]:
     return tuple(_SIDES.get(word, word) for word in words)
 
 
-def _middle(joints: Tensor, index: dict[str, int], part: str) -> Float[Tensor, "time 3"]:
+def _middle(joints: Tensor, index: Mapping[str, int], part: str) -> Float[Tensor, "time 3"]:
     return (joints[:, index[f"{part}_left"]] + joints[:, index[f"{part}_right"]]) / 2
 
 
-def _trunk_length(joints: Tensor, index: dict[str, int]) -> Float[Tensor, ""]:
+def _trunk_length(joints: Tensor, index: Mapping[str, int]) -> Float[Tensor, ""]:
     """Median over the clip, m."""
     trunk = _middle(joints, index, "shoulder") - _middle(joints, index, "hip")
     return torch.linalg.vector_norm(trunk, dim=1).nanmedian()
 
 
 def _places(
-    joints: Tensor, index: dict[str, int], wanted: tuple[str, ...], origin: Tensor, upright: bool
+    joints: Tensor, index: Mapping[str, int], wanted: tuple[str, ...], origin: Tensor, upright: bool
 ) -> Float[Tensor, "time places 3"]:
     there = [index[name] for name in wanted if name in index]
     placed = (joints[:, there] - origin.unsqueeze(1)) @ trunk_frame(joints, index, upright)
