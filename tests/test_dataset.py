@@ -108,23 +108,36 @@ def clips_by(*subjects):
     return [Clip("walk", subject, str(i), pose=torch.zeros(1, 24)) for i, subject in enumerate(subjects)]
 
 
-def test_half_of_the_subjects_train_and_then_the_other_half():
+def test_half_of_the_subjects_train_drawn_anew_each_time():
+    clips = clips_by(*map(str, range(1, 8)), "1")
+    folds = split_clips(clips, Split.half_subjects, splits=20, seed=3)
+    assert len(folds) == 20
+    assert len({fold.train for fold in folds}) > 10
+    for fold in folds:
+        assert len({clips[i].subject for i in fold.train}) == 3
+        assert len({clips[i].subject for i in fold.test}) == 4
+    assert folds == split_clips(clips, Split.half_subjects, splits=20, seed=3)
+    assert folds != split_clips(clips, Split.half_subjects, splits=20, seed=4)
+
+
+def test_odd_subjects_train_and_even_ones_test():
     clips = clips_by("10", "9", "1", "1", "2")  # in order: 1, 2, 9, 10
-    folds = split_clips(clips, Split.half_subjects)
-    assert [(fold.train, fold.test) for fold in folds] == [((1, 2, 3), (0, 4)), ((0, 4), (1, 2, 3))]
+    (fold,) = split_clips(clips, Split.cross_subject)
+    assert (fold.train, fold.test) == ((1, 2, 3), (0, 4))
 
 
 def test_each_subject_tests_once():
     clips = clips_by("b", "a", "b", "c")
-    folds = split_clips(clips, "cross_subject")
+    folds = split_clips(clips, "leave_one_subject_out")
     assert [fold.test for fold in folds] == [(1,), (0, 2), (3,)]
 
 
 @pytest.mark.parametrize("split", list(Split))
-def test_every_clip_is_tested_once_and_never_trained_on(split):
+def test_no_clip_or_subject_is_on_both_sides(split):
     clips = clips_by(*"3141592653")
     folds = split_clips(clips, split)
-    assert sorted(index for fold in folds for index in fold.test) == list(range(10))
+    if split in (Split.leave_one_sequence_out, Split.leave_one_subject_out):
+        assert sorted(index for fold in folds for index in fold.test) == list(range(10))
     for fold in folds:
         assert sorted(fold.train + fold.test) == list(range(10))
         if split is not Split.leave_one_sequence_out:
@@ -133,11 +146,13 @@ def test_every_clip_is_tested_once_and_never_trained_on(split):
 
 
 def test_impossible_splits_are_named():
-    with pytest.raises(ValueError, match=r"split must be one of half_subjects, .* got 'by_moon'"):
+    with pytest.raises(ValueError, match=r"split must be one of cross_subject, .* got 'by_moon'"):
         split_clips(clips_by("1", "2"), "by_moon")
     for split, clips in ((Split.cross_subject, clips_by("1", "1")), (Split.half_subjects, clips_by("1"))):
         with pytest.raises(ValueError, match=f"split {split.value} needs at least two .* by 1 subjects"):
             split_clips(clips, split)
+    with pytest.raises(ValueError, match="splits must be at least 1, got 0"):
+        split_clips(clips_by("1", "2"), Split.half_subjects, splits=0)
     with pytest.raises(ValueError, match="got 1 sequences"):
         split_clips(clips_by("1"), Split.leave_one_sequence_out)
 
@@ -148,5 +163,10 @@ def test_utkinect_reads(shared_data, split):
     assert len(clips) == 199
     assert sum(map(len, clips)) == 6053
     assert len({clip.activity for clip in clips}) == 10
-    expected = {"half_subjects": 2, "cross_subject": 10, "leave_one_sequence_out": 199}
-    assert len(split_clips(clips, split)) == expected[split.value]
+    expected = {
+        Split.cross_subject: 1,
+        Split.half_subjects: 5,
+        Split.leave_one_subject_out: 10,
+        Split.leave_one_sequence_out: 199,
+    }
+    assert len(split_clips(clips, split)) == expected[split]

@@ -12,15 +12,26 @@ from torchpose.activity.features import (
     BodyFrame,
     FeatureConfig,
     FeatureKind,
+    FeatureStreams,
     ICAFeature,
     JointAngleFeature,
     LimbDirectionFeature,
     PCAFeature,
     SkeletonFeature,
-    VelocityFeature,
+    Stream,
     build_feature,
+    change,
 )
-from torchpose.activity.skeleton import bone_directions, joint_index, trunk_frame
+from torchpose.activity.skeleton import (
+    arm_places,
+    bone_directions,
+    joint_distances,
+    joint_index,
+    joint_places,
+    mirror_joints,
+    travel,
+    trunk_frame,
+)
 from torchpose.activity.subspace import Crop, SilhouetteConfig, fast_ica, pca, resize_silhouettes
 
 WHO = ("walk", "1", "1")
@@ -132,6 +143,28 @@ def test_pca_gives_no_more_components_than_the_images_span(images, pixels, dtype
     assert_close(fitted.components @ fitted.components.T, torch.eye(4, dtype=dtype), rtol=0, atol=1e-4)
     centered = data - fitted.mean
     assert_close(centered @ fitted.components.T @ fitted.components, centered, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("fall", [0.99, 0.999])
+def test_few_components_of_large_images_reconstruct_as_well_as_the_exact_ones(fall, dtype):
+    """The error is that of LAPACK's decomposition to 5e-4, with a steep and a flat spectrum."""
+    images = torch.randn(1200, 1000) * fall ** torch.arange(1000)
+    images = (images @ torch.linalg.qr(torch.randn(1000, 1000)).Q + 3).to(dtype)
+    found = pca(images, 60)
+    exact = images.double() - images.double().mean(0)
+    rows = found.components.double()
+    assert_close(rows @ rows.T, torch.eye(60).double(), rtol=0, atol=1e-4)
+    error = (exact - exact @ rows.T @ rows).square().sum()
+    least = torch.linalg.svdvals(exact)[60:].square().sum()
+    assert least * (1 - 1e-6) <= error <= least * (1 + 5e-4)
+    assert_close(found.variance.double(), (exact @ rows.T).square().mean(0), rtol=1e-3, atol=0)
+    assert torch.equal(found.components, pca(images, 60).components)
+
+
+def test_large_images_that_span_little_have_few_components():
+    images = torch.randn(1100, 7, dtype=torch.float64) @ torch.randn(7, 1050, dtype=torch.float64)
+    assert pca(images, 100).components.shape == (7, 1050)
 
 
 def test_pca_of_silhouettes_that_leave_most_pixels_alone():
@@ -355,7 +388,7 @@ def test_lost_skeletons_are_lost_features():
 def test_joint_names_of_other_recorders():
     kinect = ["hip_center", "spine", "shoulder_center", "head", "left_shoulder", "right_shoulder", "left_hip"]
     kinect += ["right_hip", "left_hand"]
-    assert joint_index(kinect) == {
+    assert joint_index(tuple(kinect)) == {
         "pelvis": 0,
         "neck": 2,
         "head": 3,
@@ -365,39 +398,130 @@ def test_joint_names_of_other_recorders():
         "hip_right": 7,
     }
     camel = ["LeftShoulder", "RightShoulder", "leftHip", "HipRight", "RElbow", "l_wrist"]
-    assert set(joint_index(camel)) == {
+    assert set(joint_index(tuple(camel))) == {
         *("shoulder_left", "shoulder_right", "hip_left", "hip_right", "elbow_right", "wrist_left"),
     }
     with pytest.raises(ValueError, match="hip_right cannot be found in joint_names left_shoulder, "):
-        joint_index(["left_shoulder", "right_shoulder", "left_hip", "head"])
+        joint_index(("left_shoulder", "right_shoulder", "left_hip", "head"))
 
 
 def test_velocity_is_the_change_over_both_sides():
+    rows = torch.randn(6, 20)
+    found = change(rows, 2)
+    assert_close(found[2:4], rows[4:] - rows[:2])
+    assert_close(found[0], rows[2] - rows[0])
+    assert_close(found[5], rows[5] - rows[3])
+    assert_close(change(rows[:1], 2), torch.zeros(1, 20))
+    rows[3] = torch.nan
+    assert change(rows, 2).isnan().all(1).tolist() == [False, True, False, False, False, True]
+
+
+def test_streams_stand_in_the_order_asked_for():
     pose = torch.randn(6, 24)
-    feature = VelocityFeature(JointAngleFeature(), 2)
-    values = feature(Clip(*WHO, pose=pose))
-    still, change = values[:, :20], values[:, 20:]
+    config = FeatureConfig(streams=(Stream.velocity, Stream.feature), velocity_step=1)
+    moving, still = FeatureStreams(config)(Clip(*WHO, pose=pose))
     assert torch.equal(still, pose[:, 4:])
-    assert_close(change[2:4], pose[4:, 4:] - pose[:2, 4:])
-    assert_close(change[0], pose[2, 4:] - pose[0, 4:])
-    assert_close(change[5], pose[5, 4:] - pose[3, 4:])
-    assert_close(feature(Clip(*WHO, pose=pose[:1]))[:, 20:], torch.zeros(1, 20))
+    assert torch.equal(moving, change(pose[:, 4:], 1))
+    joints = standing() + 0.1 * torch.randn(5, 15, 3, dtype=torch.float64)
+    clip = Clip(*WHO, joints=joints, joint_names=JOINTS)
+    config = FeatureConfig(FeatureKind.skeleton, streams=tuple(Stream))
+    every = FeatureStreams(config)(clip)
+    found = dict(zip(Stream, every, strict=True))
+    assert [rows.shape[1] for rows in every] == [30, 30, 33, 33, 12, 12, 15, 3]
+    assert torch.equal(found[Stream.place_velocity], change(found[Stream.places], 2))
+    assert torch.equal(found[Stream.arms], arm_places(joints, JOINTS, True).flatten(1))
+    joints[2] = torch.nan
+    for stream, rows in zip(Stream, FeatureStreams(config)(clip), strict=True):
+        lost = rows.isnan().all(1).nonzero()[:, 0].tolist()
+        assert lost == ([0, 4] if "velocity" in stream.value else [2])  # a change needs the frames beside
+
+
+def test_a_change_is_as_uncertain_as_both_its_frames():
+    spread = torch.rand(5, 24) + 0.1
+    clip = Clip(*WHO, pose=torch.randn(5, 24), pose_sd=spread)
+    own, both = FeatureStreams(FeatureConfig(streams=(Stream.feature, Stream.velocity))).deviation(clip)
+    assert torch.equal(own, spread[:, 4:])
+    assert_close(both[2].square(), spread[0, 4:].square() + spread[4, 4:].square())
+    assert FeatureStreams().deviation(Clip(*WHO, pose=torch.randn(5, 24))) == (None,)
+
+
+def test_places_and_distances_of_a_person_who_stands():
+    joints = standing()[None]
+    places = joint_places(joints, JOINTS)[0]  # trunk 0.5 m
+    assert_close(places[0], torch.tensor([0, -1.5, 0]).double())  # head
+    assert_close(places[3], torch.tensor([0.4, 0.1, 0]).double())  # left wrist
+    assert_close(places[4], torch.tensor([-0.4, 0.1, 0]).double())
+    assert_close(arm_places(joints, JOINTS)[0, 0], torch.tensor([0.4, 1.1, 0]).double())
+    distances = joint_distances(joints, JOINTS)[0]
+    assert_close(distances[0], torch.tensor(0.8).double())  # from hand to hand
+    assert_close(distances[1], torch.tensor((0.2**2 + 0.8**2) ** 0.5 / 0.5).double())  # to the head
+
+
+def test_travel_is_way_and_rise_since_the_first_frame_seen():
+    joints = standing()[None].repeat(4, 1, 1)
+    joints[0] = torch.nan
+    joints[2] += torch.tensor([0.3, -0.2, -0.4])  # y down: up by 0.2 m
+    joints[3, JOINTS.index("head")] += torch.tensor([0, 0.1, 0])
+    expected = torch.tensor([[0, 0, 0], [1, 0.4, 0.4], [0, 0, -0.2]]).double()
+    assert_close(travel(joints, JOINTS)[1:], expected)
+    upside = joints * torch.tensor([1.0, -1, -1])
+    assert_close(travel(upside, JOINTS)[1:], expected)
+
+
+@pytest.mark.parametrize("stream", [s for s in Stream if s is not Stream.velocity])
+def test_streams_do_not_depend_on_place_heading_and_size(stream):
+    joints = standing() + 0.1 * torch.randn(7, 15, 3, dtype=torch.float64)
+    turn = torch.from_numpy(Rotation.from_euler("y", 2.1).as_matrix())
+    streams = FeatureStreams(FeatureConfig(FeatureKind.skeleton, streams=(stream,)))
+    (expected,) = streams(Clip(*WHO, joints=joints, joint_names=JOINTS))
+    (found,) = streams(Clip(*WHO, joints=1.7 * joints @ turn.T + 5, joint_names=JOINTS))
+    assert_close(found, expected)
+
+
+def test_a_mirror_image_does_the_same_with_the_other_hand():
+    joints = standing() + 0.1 * torch.randn(7, 15, 3, dtype=torch.float64)
+    other = mirror_joints(joints, JOINTS)
+    assert_close(mirror_joints(other, JOINTS), joints)
+    left, right = JOINTS.index("wrist_left"), JOINTS.index("wrist_right")
+    assert_close(other[:, left], joints[:, right] * torch.tensor([-1.0, 1, 1]))
+    assert_close(joint_distances(other, JOINTS)[:, 0], joint_distances(joints, JOINTS)[:, 0])
+    places, mirrored = joint_places(joints, JOINTS, True), joint_places(other, JOINTS, True)
+    assert_close(mirrored[:, 3], places[:, 4] * torch.tensor([-1.0, 1, 1]))  # wrists, in the body's own frame
+    camel = ["LeftShoulder", "RShoulder", "Head"]
+    assert_close(mirror_joints(joints[:, :3], tuple(camel))[:, 0], joints[:, 1] * torch.tensor([-1.0, 1, 1]))
+
+
+def test_streams_without_their_joints_are_named():
+    names = ("shoulder_left", "shoulder_right", "hip_left", "hip_right")
+    clip = Clip(*WHO, joints=torch.randn(3, 4, 3), joint_names=names)
+    with pytest.raises(
+        ValueError, match=r"the stream arms needs more joints than shoulder_left.* leave it out"
+    ):
+        FeatureStreams(FeatureConfig(FeatureKind.skeleton, streams=(Stream.arms,)))(clip)
+    with pytest.raises(ValueError, match="needs 'joints' in every clip"):
+        FeatureStreams(FeatureConfig(streams=(Stream.arms,)))(Clip(*WHO, pose=torch.zeros(3, 24)))
 
 
 @pytest.mark.parametrize("kind", list(FeatureKind))
 def test_the_configuration_builds_every_kind(kind):
-    plain, moving = build_feature(FeatureConfig(kind)), build_feature(FeatureConfig(kind, velocity_step=3))
-    assert isinstance(moving, VelocityFeature)
-    assert type(moving.feature) is type(plain)
-    assert not isinstance(plain, VelocityFeature)
+    built = {
+        FeatureKind.angles: JointAngleFeature,
+        FeatureKind.directions: LimbDirectionFeature,
+        FeatureKind.pca: PCAFeature,
+        FeatureKind.ica: ICAFeature,
+        FeatureKind.skeleton: SkeletonFeature,
+    }
+    assert isinstance(build_feature(FeatureConfig(kind)), built[kind])
 
 
 def test_bad_settings_are_named():
-    with pytest.raises(ValueError, match="velocity_step must be a number of frames or 0 for none, got -1"):
-        FeatureConfig(velocity_step=-1)
+    with pytest.raises(ValueError, match="velocity_step must be at least 1 frame, got 0"):
+        FeatureConfig(velocity_step=0)
+    with pytest.raises(ValueError, match="streams must be one or more, each once, got none"):
+        FeatureConfig(streams=())
+    with pytest.raises(ValueError, match="streams must be one or more, each once, got arms, arms"):
+        FeatureConfig(streams=(Stream.arms, Stream.arms))
     with pytest.raises(ValueError, match="num_components and ica_iterations must be at least 1"):
         FeatureConfig(num_components=0)
     with pytest.raises(ValueError, match="silhouette size must be at least 1 x 1 px, got 0 x 24"):
         SilhouetteConfig(height=0)
-    with pytest.raises(ValueError, match="step of a velocity must be at least 1 frame, got 0"):
-        VelocityFeature(JointAngleFeature(), 0)

@@ -8,9 +8,9 @@ import torch
 from hmmlearn.hmm import CategoricalHMM
 from torch.testing import assert_close
 
-from torchpose.activity.hmm import (
+from torchpose.activity import hmm
+from torchpose.activity.baum_welch import (
     MISSING,
-    DiscreteHMM,
     HMMConfig,
     Parameters,
     Status,
@@ -20,6 +20,7 @@ from torchpose.activity.hmm import (
     equal_segments,
     mask_padding,
 )
+from torchpose.activity.hmm import DiscreteHMM
 from torchpose.activity.inference import hmm_backward, hmm_filter, hmm_smoother, viterbi
 
 NO_SMOOTHING = {"emission_prior": 1.0, "transition_prior": 1.0}
@@ -226,6 +227,165 @@ def test_one_round_of_baum_welch_matches_enumerated_counts(topology, prior):
             assert_close(getattr(fitted, name)[model].exp(), mode(counts, before > 0, before))
 
 
+def stream_scores(log_emission, sequence, weights=None):
+    """log p(y_t | z_t) (T, K) of one model (R, K, V) and one sequence (T, R), by loops."""
+    time, streams = sequence.shape
+    scores = torch.zeros(time, log_emission.shape[1], dtype=torch.float64)
+    for t in range(time):
+        for r in range(streams):
+            if sequence[t, r] != MISSING:
+                share = 1.0 if weights is None else weights[t, r]
+                scores[t] += share * log_emission[r, :, sequence[t, r]]
+    return scores
+
+
+def random_streams(models, states, streams, num_symbols, topology):
+    one = random_parameters(models, states, num_symbols, topology)
+    more = [random_parameters(models, states, num_symbols).log_emission for _ in range(streams)]
+    return Parameters(one.log_initial, one.log_transition, torch.stack(more, dim=1))
+
+
+def bank_of(parameters, config=HMMConfig()):  # noqa: B008 (frozen)
+    models, *streams, _, num_symbols = parameters.log_emission.shape
+    bank = DiscreteHMM(models, num_symbols, config, streams=tuple(streams))
+    for name, value in vars(parameters).items():
+        setattr(bank, name, value)
+    return bank
+
+
+@pytest.mark.parametrize("topology", list(Topology))
+@pytest.mark.parametrize("weighted", [False, True])
+def test_streams_and_weights_match_enumeration(topology, weighted):
+    """Scores, posteriors, paths, and one round of training with Dirichlet priors."""
+    states, streams, num_symbols, prior = 3, 2, 4, 1.3
+    start = random_streams(2, states, streams, num_symbols, topology)
+    symbols = torch.randint(num_symbols, (6, 5, streams))
+    symbols[torch.rand(symbols.shape) < 0.2] = MISSING
+    weights = torch.rand(symbols.shape, dtype=torch.float64) if weighted else None
+    lengths, labels = torch.tensor([5, 3, 1, 4, 5, 2]), torch.tensor([0, 1, 0, 1, 1, 0])
+    config = HMMConfig(states, topology, prior, prior, iterations=1, tolerance=0.0)
+    bank = bank_of(start, config)
+    fitted = baum_welch(start, symbols, lengths, labels, config, weights)
+    scores = bank.log_likelihood(symbols, lengths, weights)
+    decoded = bank.decode(symbols, lengths, labels, weights)
+    smoothed = bank.smooth(symbols, lengths, labels, weights)
+
+    total = torch.zeros(2).double()
+    for model in range(2):
+        starts, moves = torch.zeros(states).double(), torch.zeros(states, states).double()
+        emitted = torch.zeros(streams, states, num_symbols).double()
+        for s, (sequence, length, label) in enumerate(
+            zip(symbols, lengths.tolist(), labels.tolist(), strict=True)
+        ):
+            share = None if weights is None else weights[s]
+            emission = stream_scores(start.log_emission[model], sequence[:length], share)
+            paths, joint = log_joint(start.log_initial[model], start.log_transition[model], emission)
+            assert_close(scores[s, model], joint.logsumexp(0), rtol=1e-12, atol=1e-12)
+            if label != model:
+                continue
+            total[model] += joint.logsumexp(0)
+            assert decoded.states[s, :length].tolist() == paths[joint.argmax()].tolist()
+            visits = torch.nn.functional.one_hot(paths, states).to(joint)
+            assert_close(smoothed.states[s, :length], torch.einsum("p,ptk->tk", joint.softmax(0), visits))
+            for path, weight in zip(paths.tolist(), joint.softmax(0), strict=True):
+                starts[path[0]] += weight
+                for before, after in itertools.pairwise(path):
+                    moves[before, after] += weight
+                for t, state in enumerate(path):
+                    for r in range(streams):
+                        if sequence[t, r] != MISSING:
+                            emitted[r, state, sequence[t, r]] += weight * (
+                                1 if share is None else share[t, r]
+                            )
+
+        for name, counts in (("log_initial", starts), ("log_transition", moves), ("log_emission", emitted)):
+            allowed = getattr(start, name)[model].exp() > 0
+            expected = torch.where(allowed, counts + prior - 1, 0.0)
+            expected = expected / expected.sum(-1, keepdim=True)
+            assert_close(getattr(fitted.parameters, name)[model].exp(), expected)
+    priors = sum(
+        (prior - 1) * rows[rows > -torch.inf].sum()
+        for rows in (start.log_initial, start.log_transition, start.log_emission)
+    )
+    assert_close(fitted.objective[0].sum(), total.sum() + priors)
+
+
+def test_two_streams_match_hmmlearn_on_the_product_of_their_symbols():
+    """One state's pairs of independent symbols are one symbol of a model whose table is the product."""
+    start = random_streams(2, 4, 2, 3, Topology.left_to_right)
+    symbols = torch.randint(3, (5, 40, 2))
+    scores = bank_of(start).log_likelihood(symbols, torch.full((5,), 40))
+    for model in range(2):
+        oracle = CategoricalHMM(4, n_features=9)
+        oracle.startprob_ = start.log_initial[model].exp().numpy()
+        oracle.transmat_ = start.log_transition[model].exp().numpy()
+        first, second = start.log_emission[model].exp()
+        oracle.emissionprob_ = (first[:, :, None] * second[:, None]).flatten(1).numpy()
+        for s, sequence in enumerate(symbols):
+            pairs = (3 * sequence[:, 0] + sequence[:, 1])[:, None].numpy()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # log 0 of the structural zeros
+                expected = oracle.score(pairs)
+            assert abs(float(scores[s, model]) - expected) < 1e-10
+
+
+def test_a_weight_of_zero_is_a_missing_symbol_and_of_one_none():
+    start = random_streams(2, 3, 2, 4, Topology.ergodic)
+    symbols, lengths = torch.randint(4, (3, 8, 2)), torch.tensor([8, 5, 1])
+    weights = (torch.rand(symbols.shape) < 0.6).double()
+    weights[2, 1:] = torch.nan  # of padding nothing is asked
+    bank = bank_of(start)
+    missing = torch.where(weights > 0, symbols, MISSING)
+    assert_close(bank.log_likelihood(symbols, lengths, weights), bank.log_likelihood(missing, lengths))
+
+
+@pytest.mark.parametrize("topology", list(Topology))
+def test_where_plain_probabilities_fall_out_of_range_logarithms_take_over(topology, monkeypatch):
+    """Of two symbols that take turns, states emit one each; a wrong one costs 46 nats and a move 120."""
+    start = random_parameters(2, 3, 4, topology)
+    emission, transition = start.log_emission.clone(), start.log_transition.clone()
+    emission[1, :2, 0], emission[1, 2, 0] = 0.0, -46.0
+    emission[1, :2, 1], emission[1, 2, 1] = -46.0, 0.0
+    transition[1] = torch.where(torch.eye(3) > 0, 0.0, transition[1] - 120)
+    start = Parameters(start.log_initial, transition, emission)
+    symbols = torch.randint(4, (3, 80))
+    symbols[1] = torch.arange(80) // 10 % 2
+    lengths = torch.tensor([80, 80, 60])
+    scores = emission_scores(emission, mask_padding(symbols, lengths))
+    exact = hmm_filter(start.log_initial[:, None], start.log_transition[:, None], scores).log_likelihood.T
+    assert_close(bank_of(start).log_likelihood(symbols, lengths), exact, rtol=1e-12, atol=0)
+
+    with monkeypatch.context() as patch:  # it is out of range, and that shows
+        patch.setattr(hmm, "exact_above", lambda dtype: -1.0)
+        with pytest.warns(RuntimeWarning, match="1 of 6 scores are minus infinity"):
+            assert torch.isneginf(bank_of(start).log_likelihood(symbols, lengths)[1, 1])
+
+    labels = torch.tensor([0, 1, 1])
+    config = HMMConfig(3, topology, **NO_SMOOTHING, iterations=1, tolerance=0.0)
+    fitted = baum_welch(start, symbols, lengths, labels, config)
+    assert_close(
+        fitted.objective[0], torch.stack([exact[0, 0], exact[1, 1] + exact[2, 1]]), rtol=1e-12, atol=0
+    )
+    smoothed = hmm_smoother(
+        start.log_initial[labels], start.log_transition[labels], scores[labels, torch.arange(3)]
+    )
+    inside = torch.arange(80) < lengths[:, None]
+    visits = torch.einsum(
+        "stk,stv->skv", smoothed.states * inside[..., None], torch.nn.functional.one_hot(symbols, 4).double()
+    )
+    counts = torch.stack([visits[0], visits[1] + visits[2]])
+    assert_close(
+        fitted.parameters.log_emission.exp(), counts / counts.sum(-1, keepdim=True), rtol=1e-9, atol=1e-15
+    )
+
+
+def test_durations_are_the_mean_stay():
+    bank = DiscreteHMM(1, 2, HMMConfig(3))
+    stay = torch.tensor([0.9, 0.5, 1.0], dtype=torch.float64)
+    bank.log_transition = (torch.diag(stay) + torch.diag(1 - stay[:2], 1)).log()[None]
+    assert_close(bank.durations[0], torch.tensor([10, 2, torch.inf]).double())
+
+
 @pytest.mark.parametrize("topology", list(Topology))
 def test_baum_welch_matches_hmmlearn(topology):
     states, num_symbols, iterations = 4, 6, 12
@@ -245,7 +405,7 @@ def test_baum_welch_matches_hmmlearn(topology):
         oracle.fit(flat, lengths.numpy())
         score = oracle.score(flat, lengths.numpy())
 
-    tolerance = {"rtol": 0, "atol": 1e-8}
+    tolerance = {"rtol": 1e-10, "atol": 1e-10}
     history = torch.tensor(list(oracle.monitor_.history), dtype=torch.float64)
     assert_close(fitted.objective[:, 0], history, **tolerance)
     assert_close(fitted.parameters.log_initial[0].exp(), torch.from_numpy(oracle.startprob_), **tolerance)
@@ -424,6 +584,14 @@ def test_bad_input_is_named():
         hmm.fit(symbols, torch.tensor([0]), labels)
     with pytest.raises(ValueError, match=r"labels must name a model in \[0, 2\).* got \[2\]"):
         hmm.fit(symbols, lengths, torch.tensor([2]))
+    with pytest.raises(
+        ValueError, match=r"must have the shape \(sequences, time\) of the bank's streams, got \(1, 3, 2\)"
+    ):
+        hmm.log_likelihood(torch.zeros(1, 3, 2, dtype=torch.long), lengths)
+    with pytest.raises(ValueError, match=r"weights must lie in \[0, 1\], .* got \(1, 3\) from 0 to 2"):
+        hmm.fit(symbols, lengths, labels, weights=torch.tensor([[0.0, 1.0, 2.0]]))
+    with pytest.raises(ValueError, match=r"a model, a symbol and a stream at least, got 1, 2 and \(0,\)"):
+        DiscreteHMM(1, 2, streams=(0,))
     with pytest.raises(ValueError, match="states must be at least 1, got 0"):
         HMMConfig(states=0)
     with pytest.raises(ValueError, match="emission_prior and transition_prior must be at least 1"):

@@ -58,7 +58,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "partition", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
-        *("inference", "hmm", "codebook", "recognizer", "diary"),
+        *("inference", "baum_welch", "hmm", "codebook", "score_layer", "recognizer", "diary"),
     ),
     "synthesis": (
         *("motion", "path", "box", "room", "actor", "render", "depth"),

@@ -8,12 +8,14 @@ import torch
 from safetensors.torch import save_file
 from torch.testing import assert_close
 
+from torchpose.activity.baum_welch import HMMConfig, Status, Topology
 from torchpose.activity.codebook import CodebookConfig, CodebookStart
 from torchpose.activity.dataset import Clip, Split, read_skeletons, split_clips
-from torchpose.activity.features import FeatureConfig, FeatureKind
-from torchpose.activity.hmm import HMMConfig, Status, Topology
+from torchpose.activity.features import FeatureConfig, FeatureKind, Stream
 from torchpose.activity.recognizer import NO_ACTIVITY, Answer, Evaluation, Recognizer, RecognizerConfig
+from torchpose.activity.score_layer import LayerConfig
 from torchpose.activity.subspace import Crop, SilhouetteConfig
+from torchpose.cli import load_config
 from torchpose.settings import compose_config
 
 ACTIVITIES = ("both", "left", "right")
@@ -49,7 +51,7 @@ def test_activities_are_told_apart(trained):
     assert [ACTIVITIES[i] for i in found.activity] == [clip.activity for clip in test]
     assert (found.answer == Answer.RECOGNIZED).all()
     assert (found.log_odds > 0).all()
-    assert set(trained.fitted.status.tolist()) <= {Status.CONVERGED, Status.MAX_ITERATIONS}
+    assert set(trained.fitted[0].status.tolist()) <= {Status.CONVERGED, Status.MAX_ITERATIONS}
 
 
 def test_scores_are_likelihoods_per_observed_frame(trained):
@@ -57,13 +59,16 @@ def test_scores_are_likelihoods_per_observed_frame(trained):
     pose = clip.pose.clone()
     pose[3:6] = torch.nan
     found = trained([replace(clip, pose=pose)])
-    symbols = trained.codebook(trained.feature(replace(clip, pose=pose)))[None]
-    total = trained.hmm.log_likelihood(symbols, torch.tensor([len(clip)]))
+    member = trained.members[0]
+    (rows,) = trained.feature(replace(clip, pose=pose))
+    symbols = member.codebooks[0](rows)[None]
+    total = member.hmm.log_likelihood(symbols[..., None], torch.tensor([len(clip)]))
     assert (symbols == -1).sum() == 3
     assert_close(found.log_likelihood, total / (len(clip) - 3))
+    assert torch.equal(found.score, found.log_likelihood)
     best = found.log_likelihood[0].sort(descending=True).values
     assert_close(found.log_odds[0], best[0] - best[1])
-    background = trained.log_background[symbols[symbols >= 0]].mean()
+    background = member.log_background[0, symbols[symbols >= 0]].mean()
     assert_close(found.log_odds_background[0], best[0] - background)
 
 
@@ -80,7 +85,8 @@ def test_training_repeats_and_the_seed_matters(trained):
     again, other = (Recognizer(replace(SMALL, seed=seed)).fit(performances()) for seed in (0, 1))
     for name, value in trained.state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
-    assert not torch.equal(other.codebook.centers, trained.codebook.centers)
+    first, second = (one.members[0].codebooks[0].centers for one in (other, trained))
+    assert not torch.equal(first, second)
 
 
 def test_a_lost_sequence_has_no_answer(trained):
@@ -131,6 +137,107 @@ def test_one_sequence_an_activity_and_sequences_shorter_than_the_states():
     assert found.answer[3] == Answer.RECOGNIZED
 
 
+def test_members_average_their_scores():
+    train, test = performances(), performances(2, seed=1)
+    both = Recognizer(replace(SMALL, members=2)).fit(train)
+    first, second = both.members
+    rows = [both.feature(clip) for clip in test]
+    frames = torch.tensor([len(clip) for clip in test])[:, None]
+    alone = []
+    for member in (first, second):
+        symbols = member.encode(rows, None)
+        alone.append(member.hmm.log_likelihood(symbols.values, symbols.lengths) / frames)
+    assert not torch.equal(*alone)
+    assert_close(both(test).log_likelihood, (alone[0] + alone[1]) / 2)
+
+
+def test_a_second_stream_tells_what_the_first_cannot():
+    """Up and down are the same poses in another order, which one state cannot tell apart but their changes can."""
+    generator = torch.Generator().manual_seed(0)
+
+    def moving(name, frames):
+        pose = 0.02 * torch.randn(frames, 24, generator=generator)
+        ramp = torch.linspace(-1, 1, frames)
+        pose[:, 6] += ramp if name == "up" else -ramp
+        return Clip(name, "1", "1", pose=pose)
+
+    lengths = torch.randint(20, 40, (20,), generator=generator).tolist()
+    train, test = (
+        [moving(n, f) for n in ("up", "down") for f in half] for half in (lengths[:10], lengths[10:])
+    )
+    hmm = HMMConfig(states=1, iterations=5)
+    still = Recognizer(RecognizerConfig(codebook=CodebookConfig(size=8), hmm=hmm)).fit(train)
+    feature = FeatureConfig(streams=(Stream.feature, Stream.velocity))
+    moves = Recognizer(RecognizerConfig(feature, CodebookConfig(size=8), hmm)).fit(train)
+    assert still.evaluate(test).accuracy < 0.8
+    assert moves.evaluate(test).accuracy == 1
+
+
+def test_certain_frames_count_more():
+    """Half the frames of a test show the other activity, but their deviations say that they are not to be trusted."""
+    config = replace(SMALL, certainty=True)
+    train, test = performances(), performances(seed=1)
+    found, plain = (Recognizer(one).fit(train) for one in (config, SMALL))
+    assert torch.equal(found(test).log_likelihood, plain(test).log_likelihood)  # nothing is known of errors
+    other = {"left": "right", "right": "left", "both": "left"}
+    generator = torch.Generator().manual_seed(2)
+    spoilt = []
+    for clip in test:
+        wrong = waving(other[clip.activity], len(clip), generator).pose
+        bad = torch.rand(len(clip), generator=generator) < 0.6
+        spread = torch.where(bad, 3.0, 0.02)[:, None].expand(-1, 24)
+        spoilt.append(replace(clip, pose=torch.where(bad[:, None], wrong, clip.pose), pose_sd=spread))
+    assert plain.evaluate(spoilt).accuracy < 0.7
+    assert found.evaluate(spoilt).accuracy > 0.9
+
+
+def test_mirror_images_teach_the_other_hand():
+    names = ("shoulder_left", "shoulder_right", "hip_left", "hip_right", "elbow_left", "elbow_right")
+    at = torch.tensor([[0.2, 1.4], [-0.2, 1.4], [0.1, 0.9], [-0.1, 0.9], [0.25, 1.1], [-0.25, 1.1]])
+    generator = torch.Generator().manual_seed(0)
+
+    def person(activity, elbow, subject="1"):
+        joints = torch.cat([at, torch.zeros(6, 1)], 1).repeat(20, 1, 1)
+        turn = torch.linspace(0, 3, 20) * (activity == "raise")
+        side = at[elbow - 4, 0].sign()
+        joints[:, elbow] = joints[:, elbow - 4] + 0.3 * torch.stack(
+            [side * turn.sin(), -turn.cos(), 0 * turn], 1
+        )
+        return Clip(
+            activity,
+            subject,
+            "1",
+            joints=joints + 0.01 * torch.randn(20, 6, 3, generator=generator),
+            joint_names=names,
+        )
+
+    right = [person(activity, 5, str(s)) for activity in ("raise", "rest") for s in range(4)]
+    left = [person("raise", 4)]
+    config = replace(SMALL, feature=FeatureConfig(FeatureKind.skeleton))
+    plain, both = (Recognizer(replace(config, mirror=mirror)).fit(right) for mirror in (False, True))
+    assert both.evaluate(left).accuracy == 1
+    odds = [one(left).score[0, 0] - one(left).score[0, 1] for one in (plain, both)]
+    assert odds[1] > odds[0]
+    with pytest.raises(ValueError, match=r"mirror needs joint positions .* set mirror=false"):
+        Recognizer(replace(SMALL, mirror=True)).fit(performances(1))
+
+
+def test_the_layer_keeps_what_is_right_and_gives_probabilities():
+    generator = torch.Generator().manual_seed(0)
+    train = [waving(name, 25, generator, str(s)) for name in ACTIVITIES for s in range(6)]
+    recognizer = Recognizer(replace(SMALL, layer=LayerConfig(enabled=True))).fit(train)
+    test = performances(seed=1)
+    found = recognizer(test)
+    assert recognizer.evaluate(test).accuracy == 1
+    assert_close(found.score.exp().sum(1), torch.ones(len(test)).double())
+    lost = replace(test[0], pose=torch.full_like(test[0].pose, torch.nan))
+    assert recognizer([lost]).answer.tolist() == [Answer.UNOBSERVED]
+    alone = [waving(name, 25, generator, "1") for name in ACTIVITIES for _ in range(3)]  # a single subject
+    assert Recognizer(recognizer.config).fit(alone).evaluate(test).accuracy > 0.9
+    with pytest.raises(ValueError, match="the layer needs activities that several subjects did, got none"):
+        Recognizer(recognizer.config).fit([waving(name, 25, generator, name) for name in ACTIVITIES])
+
+
 def test_a_single_activity_is_the_answer():
     found = Recognizer(SMALL).fit(performances()[:8])(performances()[:1])
     assert found.activity.tolist() == [0]
@@ -169,9 +276,18 @@ def test_a_saved_recogniser_comes_back_from_its_folder_alone(tmp_path, kind):
         )
         for clip in performances(2)
     ]
-    feature = FeatureConfig(kind, velocity_step=2, num_components=5, silhouette=SilhouetteConfig(8, 6))
+    feature = FeatureConfig(
+        kind, (Stream.feature, Stream.velocity), num_components=5, silhouette=SilhouetteConfig(8, 6)
+    )
     config = RecognizerConfig(
-        feature, CodebookConfig(size=9), HMMConfig(states=3), rejection_threshold=-1.0, seed=7
+        feature,
+        CodebookConfig(size=9),
+        HMMConfig(states=3),
+        LayerConfig(enabled=kind is not FeatureKind.pca),
+        members=2,
+        certainty=True,
+        rejection_threshold=-1.0,
+        seed=7,
     )
     recognizer = Recognizer(config).fit(clips)
     recognizer.save(tmp_path / "model")
@@ -207,7 +323,7 @@ def test_damaged_folders_are_named(trained, tmp_path):
         with pytest.raises(ValueError, match=r"recognizer\.yaml and .* must be of one training"):
             Recognizer.load(tmp_path)
     settings.write_text(text)
-    save_file({"log_background": torch.zeros(1)}, weights)  # somebody else's, without our metadata
+    save_file({"members.0.log_background": torch.zeros(1)}, weights)  # somebody else's, without our metadata
     with pytest.raises(ValueError, match=r"recognizer\.yaml and .* must be of one training"):
         Recognizer.load(tmp_path)
     weights.write_bytes(binary)
@@ -251,6 +367,12 @@ def test_bad_input_is_named(trained):
         ValueError, match=r"needs 'silhouettes' in every clip, but clip 'both' .* has only pose"
     ):
         Recognizer(replace(SMALL, feature=FeatureConfig(FeatureKind.pca))).fit(clips)
+    with pytest.raises(ValueError, match="members must be at least 1, got 0"):
+        RecognizerConfig(members=0)
+    with pytest.raises(ValueError, match="penalty of the layer must be positive, got 0"):
+        LayerConfig(penalty=0.0)
+    with pytest.raises(ValueError, match="the layer needs 2 folds and 1 iteration at least, got 1 and 100"):
+        LayerConfig(folds=1)
     with pytest.raises(ValueError, match="has not learned any activity; call fit or load first"):
         Recognizer(SMALL)(clips)
     with pytest.raises(ValueError, match="at least one clip to recognise"):
@@ -259,16 +381,16 @@ def test_bad_input_is_named(trained):
         trained.evaluate([replace(clips[0], activity="jumping")])
 
 
+@pytest.mark.slow
 def test_utkinect_is_recognised(shared_data):
-    """Two folds of half the subjects; trials reached 84.9 % with 64 symbols, ours 89 (four seeds)."""
+    """Odd subjects train, one member of configs/experiment/skeleton.yaml: 96 % (95 by three)."""
     clips = read_skeletons(shared_data / "utkinect.npz")
-    config = RecognizerConfig(FeatureConfig(FeatureKind.skeleton))
+    config = replace(load_config("train", ["experiment=skeleton"]).recognizer, members=1)
+    config = replace(config, feature=replace(config.feature, kind=FeatureKind.skeleton))
+    (fold,) = split_clips(clips, Split.cross_subject)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        first, second = (
-            Recognizer(config).fit([clips[i] for i in fold.train]).evaluate([clips[i] for i in fold.test])
-            for fold in split_clips(clips, Split.half_subjects)
-        )
-    result = first + second
-    assert result.confusion.sum() + result.unanswered.sum() == 199
-    assert result.accuracy > 0.849
+        recognizer = Recognizer(config).fit([clips[i] for i in fold.train])
+        result = recognizer.evaluate([clips[i] for i in fold.test])
+    assert result.confusion.sum() + result.unanswered.sum() == 99
+    assert result.accuracy > 0.9

@@ -15,7 +15,7 @@ from torchpose.activity.features import FeatureConfig, FeatureKind
 from torchpose.activity.recognizer import Evaluation, Recognizer, RecognizerConfig
 from torchpose.cli import load_config, train_main
 from torchpose.clips import ClipMaker, build_database
-from torchpose.study import THESIS_ACCURACY, FeatureScore, count_material, run_study, study_table
+from torchpose.study import THESIS_ACCURACY, FeatureScore, count_material, run_study, study_notes, study_table
 from torchpose.synthesis.database import plan_database
 
 RECOGNIZER = RecognizerConfig(FeatureConfig(num_components=10), CodebookConfig(size=8, restarts=1))
@@ -62,7 +62,7 @@ def test_the_study_counts_right_and_wrong_answers(tmp_path: Path, stand_in: Make
 
 def test_folds_add_up_and_the_recogniser_learns_from_all_of_them(tmp_path: Path, stand_in: Maker):
     clips = build_database(tiny_maker(tmp_path), workers=1).clips
-    folds = split_clips(clips, Split.half_subjects)
+    folds = split_clips(clips, Split.leave_one_subject_out)
     assert len(folds) == 2
     score = run_study(clips, folds, [FeatureKind.angles], RECOGNIZER)[0]
     assert int(score.evaluation.confusion.sum()) == 8
@@ -165,25 +165,42 @@ def write_skeletons(
 
 
 @pytest.mark.parametrize(
-    ("split", "folds"), [("half_subjects", 2), ("cross_subject", 4), ("leave_one_sequence_out", 16)]
+    ("split", "folds", "tests"),
+    [
+        ("half_subjects", 3, 24),
+        ("cross_subject", 1, 8),
+        ("leave_one_subject_out", 4, 16),
+        ("leave_one_sequence_out", 16, 16),
+    ],
 )
 def test_skeletons_go_through_the_same_study(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], split: str, folds: int
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], split: str, folds: int, tests: int
 ):
     data = write_skeletons(tmp_path / "skeletons.npz")
-    small = ("recognizer.codebook.size=6", "recognizer.codebook.restarts=1", f"output={tmp_path}")
+    small = (
+        "recognizer.codebook.size=6",
+        "recognizer.members=1",
+        "recognizer.feature.streams=[feature,velocity]",
+        "splits=3",
+        f"output={tmp_path}",
+    )
     code, out, err = run(capsys, "experiment=skeleton", f"data.path={data}", f"split={split}", *small)
     assert (code, err) == (0, "")
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["data"] == {
         "sequences": 16,
-        "tests": 16,
+        "tests": tests,
         "folds": folds,
         "frames": results["data"]["frames"],
         "lost_frames": 0,
+        "short_sequences": 0,
+        "single_sequence_activities": 0,
     }
     skeleton = results["features"]["skeleton"]
-    assert skeleton["confusion"] == [[8, 0], [0, 8]]
+    assert skeleton["confusion"] == [[tests // 2, 0], [0, tests // 2]]
+    assert skeleton["accuracy_by_fold"] == [1.0] * folds
+    assert ("+- of the folds" in out) == (split in ("half_subjects", "leave_one_subject_out"))
+    assert (tmp_path / "confusion.png").stat().st_size > 5000
     assert skeleton["accuracy_by_class"] == {"wave": 1.0, "rest": 1.0}
     assert "thesis" not in out
     assert Recognizer.load(tmp_path / "recognizers" / "skeleton").activities == ("wave", "rest")
@@ -201,11 +218,12 @@ def test_skeletons_go_through_the_same_study(
             "data.path must be a skeleton data set for the features [skeleton], got null",
         ),
         (["data.path=x.npz"], "features must be [skeleton] for a skeleton data set, got [pca, ica, angles]"),
-        (["split=odd"], "split must be one of half_subjects, cross_subject, leave_one_sequence_out"),
+        (["split=odd"], "split must be one of cross_subject, half_subjects, leave_one_subject_out"),
         (["experiment=slow"], "unknown experiment 'slow'"),
         (["features=[]"], "features must be one or more, each once, got none"),
         (["features=[pca,pca]"], "features must be one or more, each once, got pca, pca"),
         (["features=[pcb]"], "features must be a list [...]"),
+        (["splits=0"], "splits must be at least 1, got 0"),
         (["workers=0"], "workers must be at least 1, got 0"),
         (["recognizer.feature.kind=pca"], "recognizer.feature.kind and recognizer.seed must be left alone"),
         (["recognizer.seed=1"], "recognizer.feature.kind and recognizer.seed must be left alone"),
@@ -256,7 +274,7 @@ def scored(
     names = ("left_hand", "boxing", *(f"activity_{n}" for n in range(2, len(confusion))))
     lacking = torch.tensor(unanswered or [0] * len(confusion))
     evaluation = Evaluation(names[: len(confusion)], torch.tensor(confusion), lacking)
-    return FeatureScore(kind, evaluation, 1.25, Recognizer())
+    return FeatureScore(kind, evaluation, (evaluation.accuracy,), 1.25, Recognizer())
 
 
 def test_the_tables_stand_side_by_side():
@@ -295,8 +313,21 @@ def test_lost_frames_are_counted():
         Clip("a", "1", "1", joints=joints, joint_names=JOINTS),
         Clip("a", "2", "1", pose=torch.zeros(5, 24)),
     ]
-    counted = count_material(clips, [Fold((0,), (1,))])
-    assert counted == {"sequences": 2, "tests": 1, "folds": 1, "frames": 9, "lost_frames": 2}
+    counted = count_material(clips, [Fold((0,), (1,))], states=5)
+    assert counted == {
+        "sequences": 2,
+        "tests": 1,
+        "folds": 1,
+        "frames": 9,
+        "lost_frames": 2,
+        "short_sequences": 1,
+        "single_sequence_activities": 0,
+    }
+    odd = count_material([clips[0], replace(clips[1], activity="b")], [Fold((0,), (1,))], states=6)
+    assert (odd["short_sequences"], odd["single_sequence_activities"]) == (2, 2)
+    about = {"data": odd, "seconds": {"all": 1.0, "data": 0.0}}
+    assert "2 sequences have fewer frames than the HMMs have states" in study_notes(about)
+    assert "2 activities have a single sequence" in study_notes(about)
 
 
 def test_what_train_does_without_settings_takes_minutes():

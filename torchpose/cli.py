@@ -102,6 +102,7 @@ class TrainConfig:
     # feature sets to compare: angles, directions, pca, ica; of a skeleton data set: skeleton
     features: tuple[FeatureKind, ...] = (FeatureKind.pca, FeatureKind.ica, FeatureKind.angles)
     split: Split = Split.half_subjects  # of a skeleton data set; our own has test people of its own
+    splits: int = 5  # of half_subjects: how often the training half is drawn
     data: DataConfig = field(default_factory=DataConfig)
     recognizer: RecognizerConfig = field(default_factory=RecognizerConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)
@@ -111,6 +112,8 @@ class TrainConfig:
         if not self.features or len(set(self.features)) < len(self.features):
             names = ", ".join(kind.value for kind in self.features)
             raise ValueError(f"features must be one or more, each once, got {names or 'none'}; name some")
+        if self.splits < 1:
+            raise ValueError(f"splits must be at least 1, got {self.splits}; 5 is usual")
         if self.workers < 1:
             raise ValueError(
                 f"workers must be at least 1, got {self.workers}; one for each idle core is good"
@@ -227,14 +230,14 @@ def train(config: TrainConfig, device: torch.device) -> None:
         "version": __version__,
         "settings": settings_of(config),
         "seed": config.seed,
-        "data": count_material(clips, folds) | notes,
+        "data": count_material(clips, folds, config.recognizer.hmm.states) | notes,
         "seconds": {"data": prepared, "all": time.perf_counter() - begin},
     }
     output = Path(config.output)
     write_study(output, scores, about)
     thesis = THESIS_ACCURACY if config.data.path is None else {}
     print(study_table(scores, thesis, shutil.get_terminal_size().columns))
-    print(f"\n{study_notes(about)}\nresults        {output}/ results.json, recognizers/")
+    print(f"\n{study_notes(about)}\nresults        {output}/ results.json, confusion.png, recognizers/")
 
 
 def _material(
@@ -257,7 +260,7 @@ def _material(
             f"features must be [skeleton] for a skeleton data set, got [{names}]; add experiment=skeleton"
         )
     clips = read_skeletons(config.data.path)
-    return clips, split_clips(clips, config.split), {}
+    return clips, split_clips(clips, config.split, config.splits, config.seed), {}
 
 
 def run_command(kind: Kind, argv: Sequence[str], action: Callable[[Any, torch.device], None]) -> int:

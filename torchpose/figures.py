@@ -1,10 +1,10 @@
-"""Pictures for people: the pose drawn over an image, and the joint angles over time.
+"""Pictures for people: the pose drawn over an image, the joint angles over time, and confusion matrices.
 
 Pixels (u, v) are column and row, an integer is a pixel's centre. Angles come in radians and are drawn in
 degrees. Left and right are the subject's.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor, from_numpy
 
+from torchpose.activity.recognizer import Evaluation
 from torchpose.atomic import replacing
 from torchpose.export import JOINT_NAMES, PoseSequence
 
@@ -137,6 +138,48 @@ def plot_angles(path: Path, sequence: PoseSequence) -> None:
     )
     with replacing(path) as partial:
         figure.savefig(partial, dpi=110)
+
+
+def plot_confusions(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
+    """Draw confusion matrices side by side to a PNG, by title: a row is the truth, a column the answer, `-` none.
+
+    The shade is the share of the row; a cell has its count, and beside a name stands how often it was right.
+    """
+    from matplotlib.figure import Figure
+
+    size = max(len(evaluation.activities) for evaluation in evaluations.values())
+    figure = Figure(
+        figsize=((0.42 * size + 1.6) * len(evaluations) + 1, 0.42 * size + 2.2), layout="constrained"
+    )
+    panels = figure.subplots(1, len(evaluations), squeeze=False)[0]
+    for number, (axes, (title, evaluation)) in enumerate(zip(panels, evaluations.items(), strict=True)):
+        _draw_confusion(axes, evaluation, named=number == 0)
+        axes.set_title(f"{title}: {100 * evaluation.accuracy:.1f} % right", fontsize=10)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=110)
+
+
+def _draw_confusion(axes: "Axes", evaluation: Evaluation, named: bool) -> None:
+    counts = evaluation.confusion.numpy()
+    columns = [name.replace("_", " ") for name in evaluation.activities]
+    rows = [
+        f"{name}  {100 * right:.0f} %" if np.isfinite(right) else name
+        for name, right in zip(columns, evaluation.accuracy_by_class.values(), strict=True)
+    ]
+    if evaluation.unanswered.any():
+        counts = np.concatenate([counts, evaluation.unanswered.numpy()[:, None]], axis=1)
+        columns = [*columns, "-"]
+    share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="equal")
+    for row, column in zip(*np.nonzero(counts), strict=True):
+        colour = "white" if share[row, column] > 0.6 else "black"
+        axes.text(column, row, str(counts[row, column]), ha="center", va="center", color=colour, fontsize=8)
+    axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
+    axes.set_yticks(range(len(rows)), rows, fontsize=8)
+    axes.set_xlabel("answer")
+    if named:
+        axes.set_ylabel("truth")
+    axes.tick_params(length=0)
 
 
 def _panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:

@@ -3,8 +3,10 @@
 Accuracies are shares, 0 to 1; seconds are of the wall clock.
 """
 
+import statistics
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from torchpose.activity.dataset import Clip, Fold
 from torchpose.activity.features import FeatureKind
 from torchpose.activity.recognizer import Evaluation, Recognizer, RecognizerConfig
 from torchpose.export import write_summary
+from torchpose.figures import plot_confusions
 
 # Tables 5.3 to 5.5, 8 activities, 15 training and 40 test sequences each.
 THESIS_ACCURACY = {FeatureKind.pca: 0.5812, FeatureKind.ica: 0.6406, FeatureKind.angles: 0.9281}
@@ -36,6 +39,7 @@ class FeatureScore:
 
     kind: FeatureKind
     evaluation: Evaluation  # of all folds together
+    of_folds: tuple[float, ...]  # accuracy of each
     seconds: float  # to train and to score, all folds
     recognizer: Recognizer  # of the training clips where there is one fold, else of all clips
 
@@ -79,7 +83,8 @@ def _score(clips: Sequence[Clip], folds: Sequence[Fold], config: RecognizerConfi
     seconds = time.perf_counter() - begin
     if len(folds) > 1:
         recognizer = Recognizer(config, activities).fit(clips)
-    return FeatureScore(config.feature.kind, evaluation, seconds, recognizer)
+    of_folds = tuple(part.accuracy for part in evaluations)
+    return FeatureScore(config.feature.kind, evaluation, of_folds, seconds, recognizer)
 
 
 def _check_folds(clips: Sequence[Clip], folds: Sequence[Fold]) -> None:
@@ -93,8 +98,12 @@ def _check_folds(clips: Sequence[Clip], folds: Sequence[Fold]) -> None:
                 )
 
 
-def count_material(clips: Sequence[Clip], folds: Sequence[Fold]) -> dict[str, int]:
-    """How many sequences, tests and frames there are, and frames of which nothing is known."""
+def count_material(clips: Sequence[Clip], folds: Sequence[Fold], states: int) -> dict[str, int]:
+    """How many sequences, tests and frames there are, and how much of it says little.
+
+    That is: frames of which nothing is known, sequences with fewer frames than an HMM has states, which end before its
+    last state, and activities with a single sequence.
+    """
     first = [clip.pose if clip.joints is None else clip.joints.flatten(1) for clip in clips]
     return {
         "sequences": len(clips),
@@ -102,6 +111,10 @@ def count_material(clips: Sequence[Clip], folds: Sequence[Fold]) -> dict[str, in
         "folds": len(folds),
         "frames": sum(len(clip) for clip in clips),
         "lost_frames": sum(int(rows.isnan().any(1).sum()) for rows in first if rows is not None),
+        "short_sequences": sum(len(clip) < states for clip in clips),
+        "single_sequence_activities": sum(
+            count == 1 for count in Counter(clip.activity for clip in clips).values()
+        ),
     }
 
 
@@ -110,6 +123,7 @@ def results_of(score: FeatureScore) -> dict[str, Any]:
     evaluation = score.evaluation
     return {
         "accuracy": evaluation.accuracy,
+        "accuracy_by_fold": score.of_folds,
         "accuracy_by_class": evaluation.accuracy_by_class,
         "confusion": evaluation.confusion.tolist(),
         "unanswered": dict(zip(evaluation.activities, evaluation.unanswered.tolist(), strict=True)),
@@ -118,12 +132,13 @@ def results_of(score: FeatureScore) -> dict[str, Any]:
 
 
 def write_study(folder: Path, scores: Sequence[FeatureScore], about: Mapping[str, Any]) -> None:
-    """Write each feature set's recogniser into `recognizers/NAME/`, then `results.json` with `about` beside the scores.
+    """Write recognisers into `recognizers/NAME/`, `confusion.png`, then `results.json` with `about` beside the scores.
 
     Its `activities` are in the order of the rows and columns of each confusion table.
     """
     for score in scores:
         score.recognizer.save(folder / "recognizers" / score.kind.value)
+    plot_confusions(folder / "confusion.png", {_TITLES[score.kind]: score.evaluation for score in scores})
     results = {score.kind.value: results_of(score) for score in scores}
     activities = scores[0].evaluation.activities
     write_summary(folder / "results.json", {**about, "activities": activities, "features": results})
@@ -139,7 +154,11 @@ def study_table(
     reference = reference or {}
     activities = scores[0].evaluation.activities
     labels = ["", "", *(f"{number} {name}" for number, name in enumerate(activities, 1)), "right"]
-    labels += ["in the thesis"] * bool(reference) + ["seconds"]
+    # Of a fold with a test or two the share says nothing.
+    spread = all(len(score.of_folds) > 1 for score in scores) and all(
+        int(score.evaluation.confusion.sum()) > len(activities) * len(score.of_folds) for score in scores
+    )
+    labels += ["+- of the folds"] * spread + ["in the thesis"] * bool(reference) + ["seconds"]
     column = max(map(len, labels))
     unanswered = any(bool(score.evaluation.unanswered.any()) for score in scores)
     tables = [_counts(score.evaluation, unanswered) for score in scores]
@@ -148,6 +167,8 @@ def study_table(
     for score, rows in zip(scores, tables, strict=True):
         lines = [_TITLES[score.kind], *("".join(text.rjust(cell) for text in row) for row in rows)]
         lines.append(f"{100 * score.evaluation.accuracy:.2f} %")
+        if spread:
+            lines.append(f"{100 * statistics.stdev(score.of_folds):.2f} %")
         if reference:
             lines.append(f"{100 * reference[score.kind]:.2f} %" if score.kind in reference else "")
         lines.append(f"{score.seconds:.1f}")
@@ -180,6 +201,12 @@ def study_notes(about: Mapping[str, Any]) -> str:
         f"sequences      {data['sequences']}, {data['tests']} tested{folds}; {data['frames']} frames, "
         f"{data['lost_frames']} without a pose"
     ]
+    if data["short_sequences"]:
+        lines.append(
+            f"too short      {data['short_sequences']} sequences have fewer frames than the HMMs have states"
+        )
+    if data["single_sequence_activities"]:
+        lines.append(f"few            {data['single_sequence_activities']} activities have a single sequence")
     if "angle_error_deg" in data:
         lines.append(
             f"limb angles    {data['angle_error_deg']:.1f} degrees off the rendered truth, on average"

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.activity.hmm import MISSING
+from torchpose.activity.baum_welch import MISSING
 
 
 class CodebookStart(Enum):
@@ -64,7 +64,9 @@ def nearest(
 ) -> Int[Tensor, "*batch"]:
     """The nearest centre of each point, by |c|^2 - 2 x.c: one matrix product, no (N, V, F) differences."""
     half_norm = centers.square().sum(1) / 2
-    return (half_norm - points @ centers.T).argmin(-1)
+    # `addmm` fills one matrix instead of two, which is most of the time.
+    distance = torch.addmm(half_norm, points.reshape(-1, points.shape[-1]), centers.T, alpha=-1)
+    return distance.argmin(-1).view(points.shape[:-1])
 
 
 def _squared_distance(points: Tensor, centers: Tensor, symbols: Tensor) -> Float[Tensor, " points"]:
@@ -162,6 +164,7 @@ class Codebook(nn.Module):
     mean: Float[Tensor, " features"]
     scale: Float[Tensor, " features"]
     centers: Float[Tensor, "symbols features"]
+    distortion: Float[Tensor, ""]  # mean squared distance of a training point from its code vector
 
     def __init__(self, config: CodebookConfig = CodebookConfig()) -> None:
         super().__init__()
@@ -169,6 +172,7 @@ class Codebook(nn.Module):
         self.register_buffer("mean", torch.empty(0))
         self.register_buffer("scale", torch.empty(0))
         self.register_buffer("centers", torch.empty(0, 0))
+        self.register_buffer("distortion", torch.zeros(()))
 
     def fit(
         self, features: Float[Tensor, "points features"], generator: torch.Generator | None = None
@@ -214,8 +218,17 @@ class Codebook(nn.Module):
                 ),
                 key=lambda fitted: float(fitted.inertia),
             )
-        self.centers = best.centers
+        self.centers, self.distortion = best.centers, best.inertia / len(points)
         return best
+
+    def certainty(self, deviation: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch"]:
+        """How far symbols can be trusted, in [0, 1], from their features' standard deviations; NaN is not known: 0.
+
+        q / (q + s), with q the distortion that the codebook itself brings and s the expected squared error. At s = q,
+        noise moves a point as far as quantising does, which is about as often to another symbol as not.
+        """
+        error = (deviation / self.scale).nan_to_num(nan=0.0).square().sum(-1)
+        return torch.where(error > 0, self.distortion / (self.distortion + error), 1.0)
 
     def forward(self, features: Float[Tensor, "*batch features"]) -> Int[Tensor, "*batch"]:
         """The symbol of each feature vector, in [0, V); -1 where a feature is NaN."""

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 POSE_PARAMETERS = 24  # 3 translations, yaw, pitch, roll, 18 joint parameters
-_STREAMS = ("pose", "directions", "silhouettes", "joints")
+_STREAMS = ("pose", "directions", "silhouettes", "joints", "pose_sd")
 _FIELDS = ("joints", "offsets", "label", "subject", "take", "joint_names")
 
 
@@ -38,6 +38,8 @@ class Clip:
     silhouettes: Float[Tensor, "images height width"] | Bool[Tensor, "images height width"] | None = None
     joints: Float[Tensor, "skeletons joints 3"] | None = None  # m, any frame; needs `joint_names`
     joint_names: tuple[str, ...] = ()
+    # Standard deviations of the pose, in its units, where they are known.
+    pose_sd: Float[Tensor, "spreads 24"] | None = None
 
     def __post_init__(self) -> None:
         lengths = {name: len(stream) for name in _STREAMS if (stream := getattr(self, name)) is not None}
@@ -72,8 +74,9 @@ class Clip:
 class Split(Enum):
     """How sequences are divided. Lower-case names, as Hydra reads an enum by its member's name."""
 
-    half_subjects = "half_subjects"  # every other subject trains, the rest tests; then the other way round
-    cross_subject = "cross_subject"  # each subject in turn tests, all others train
+    cross_subject = "cross_subject"  # odd subjects train (the first, third ... in order), even ones test
+    half_subjects = "half_subjects"  # half the subjects train, drawn anew `splits` times
+    leave_one_subject_out = "leave_one_subject_out"  # each subject in turn tests, all others train
     leave_one_sequence_out = "leave_one_sequence_out"  # each sequence in turn tests, all others train
 
 
@@ -85,8 +88,8 @@ class Fold:
     test: tuple[int, ...]
 
 
-def split_clips(clips: Sequence[Clip], split: Split | str) -> list[Fold]:
-    """The folds of a protocol; over all of them every clip is tested once.
+def split_clips(clips: Sequence[Clip], split: Split | str, splits: int = 5, seed: int = 0) -> list[Fold]:
+    """The folds of a protocol; `splits` and `seed` are of `half_subjects`, where an odd subject more tests.
 
     Raises:
         ValueError: an unknown protocol, or too few subjects or sequences for it.
@@ -96,22 +99,33 @@ def split_clips(clips: Sequence[Clip], split: Split | str) -> list[Fold]:
     except ValueError:
         known = ", ".join(member.value for member in Split)
         raise ValueError(f"split must be one of {known}, got '{split}'") from None
-    if split is Split.leave_one_sequence_out:
-        groups = [{index} for index in range(len(clips))]
-    else:
-        subjects = sorted({clip.subject for clip in clips}, key=_natural)
-        of_subject = [{i for i, clip in enumerate(clips) if clip.subject == name} for name in subjects]
-        if split is Split.cross_subject:
-            groups = of_subject
-        else:  # the first, third, fifth subject train first, so the others test first
-            groups = [set().union(*of_subject[1::2]), set().union(*of_subject[::2])]
-    if len(groups) < 2 or not all(groups):
+    if splits < 1:
+        raise ValueError(f"splits must be at least 1, got {splits}; 5 is usual")
+    subjects = sorted({clip.subject for clip in clips}, key=_natural)
+    by_sequence = split is Split.leave_one_sequence_out
+    if (len(clips) if by_sequence else len(subjects)) < 2:
         raise ValueError(
             f"split {split.value} needs at least two subjects or sequences to tell training from test, got "
-            f"{len(clips)} sequences by {len({clip.subject for clip in clips})} subjects"
+            f"{len(clips)} sequences by {len(subjects)} subjects"
         )
+    match split:
+        case Split.leave_one_sequence_out:
+            tests = [{index} for index in range(len(clips))]
+        case Split.leave_one_subject_out:
+            tests = [_of_subjects(clips, {name}) for name in subjects]
+        case Split.cross_subject:
+            tests = [_of_subjects(clips, set(subjects[1::2]))]
+        case Split.half_subjects:
+            generator = torch.Generator().manual_seed(seed)
+            orders = [torch.randperm(len(subjects), generator=generator).tolist() for _ in range(splits)]
+            half = len(subjects) // 2
+            tests = [_of_subjects(clips, {subjects[i] for i in order[half:]}) for order in orders]
     everything = range(len(clips))
-    return [Fold(tuple(i for i in everything if i not in test), tuple(sorted(test))) for test in groups]
+    return [Fold(tuple(i for i in everything if i not in test), tuple(sorted(test))) for test in tests]
+
+
+def _of_subjects(clips: Sequence[Clip], names: set[str]) -> set[int]:
+    return {index for index, clip in enumerate(clips) if clip.subject in names}
 
 
 def _natural(name: str) -> tuple[int, int, str]:

@@ -1,4 +1,4 @@
-"""Features of a clip, one vector a frame (T. 4.2, 4.3): joint angles, limb directions, PCA, ICA, skeletons.
+"""Features of a clip (T. 4.2, 4.3): joint angles, limb directions, PCA, ICA, skeletons, and streams beside them.
 
 Every feature has the same interface: `fit` on the training clips, then call it with a clip. A frame that was
 lost has a row of NaN. Angles in rad, directions are unit vectors.
@@ -14,7 +14,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose.activity.dataset import Clip
-from torchpose.activity.skeleton import bone_directions
+from torchpose.activity.skeleton import (
+    arm_places,
+    bone_directions,
+    joint_distances,
+    joint_index,
+    joint_places,
+    travel,
+)
 from torchpose.activity.subspace import SilhouetteConfig, fast_ica, pca, resize_silhouettes
 
 
@@ -26,6 +33,19 @@ class FeatureKind(Enum):
     pca = "pca"  # silhouettes on principal components (4.4)
     ica = "ica"  # silhouettes on independent components (4.8)
     skeleton = "skeleton"  # bone directions from joint positions
+
+
+class Stream(Enum):
+    """What an HMM sees side by side, each by a codebook of its own; all but the first two need joint positions."""
+
+    feature = "feature"  # what `kind` names
+    velocity = "velocity"  # its change
+    places = "places"  # head and limb joints from the hips
+    place_velocity = "place_velocity"  # their change
+    arms = "arms"  # wrists and elbows from the shoulders
+    arm_velocity = "arm_velocity"  # their change
+    distances = "distances"  # between the hands, and from them to head, trunk and knees
+    travel = "travel"  # way and rise since the first frame
 
 
 class BodyFrame(Enum):
@@ -40,7 +60,8 @@ class FeatureConfig:
     """Which feature and how; each kind reads its own part."""
 
     kind: FeatureKind = FeatureKind.angles  # angles, directions, pca, ica or skeleton
-    velocity_step: int = 0  # append x(t + step) - x(t - step); 0 appends nothing
+    streams: tuple[Stream, ...] = (Stream.feature,)  # seen side by side
+    velocity_step: int = 2  # frames: a change is x(t + step) - x(t - step)
     num_components: int = 150  # pca, ica: m of the thesis
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)  # pca, ica
     ica_iterations: int = 200  # ica: at most, of FastICA
@@ -48,10 +69,11 @@ class FeatureConfig:
     frame: BodyFrame = BodyFrame.heading  # skeleton: heading or trunk
 
     def __post_init__(self) -> None:
-        if self.velocity_step < 0:
-            raise ValueError(
-                f"velocity_step must be a number of frames or 0 for none, got {self.velocity_step}"
-            )
+        if self.velocity_step < 1:
+            raise ValueError(f"velocity_step must be at least 1 frame, got {self.velocity_step}")
+        if not self.streams or len(set(self.streams)) < len(self.streams):
+            names = ", ".join(stream.value for stream in self.streams)
+            raise ValueError(f"streams must be one or more, each once, got {names or 'none'}; name some")
         if self.num_components < 1 or self.ica_iterations < 1 or self.ica_tolerance <= 0:
             raise ValueError(
                 "num_components and ica_iterations must be at least 1 and ica_tolerance positive, got "
@@ -70,6 +92,82 @@ class Feature(nn.Module, ABC):
     def forward(self, clip: Clip) -> Float[Tensor, "time features"]:
         """The features of each frame, NaN where the frame was lost."""
 
+    def deviation(self, clip: Clip) -> Float[Tensor, "time features"] | None:
+        """Standard deviation of each feature by what the recorder knew of its errors; none where it knew nothing."""
+        return None
+
+
+class FeatureStreams(nn.Module):
+    """A clip's streams: the feature and what else the configuration names, one vector a frame each.
+
+    A frame is lost in the streams that need it: a change is lost if either of its frames was.
+    """
+
+    def __init__(self, config: FeatureConfig = FeatureConfig()) -> None:
+        super().__init__()
+        self.config = config
+        self.feature = build_feature(config)
+
+    def fit(self, clips: Sequence[Clip], generator: torch.Generator) -> None:
+        """Learn the feature from the training clips."""
+        self.feature.fit(clips, generator)
+
+    def forward(self, clip: Clip) -> tuple[Float[Tensor, "time _"], ...]:
+        """Each stream's vectors, in the order of `config.streams`."""
+        step = self.config.velocity_step
+        needed = set(self.config.streams)
+        feature = self.feature(clip) if needed & {Stream.feature, Stream.velocity} else None
+        found = []
+        for stream in self.config.streams:
+            match stream:
+                case Stream.feature | Stream.velocity:
+                    assert feature is not None
+                    rows = feature
+                case _:
+                    rows = self._of_joints(stream, clip)
+            moves = stream in (Stream.velocity, Stream.place_velocity, Stream.arm_velocity)
+            found.append(change(rows, step) if moves else rows)
+        return tuple(found)
+
+    def deviation(self, clip: Clip) -> tuple[Float[Tensor, "time _"] | None, ...]:
+        """Standard deviations of each stream, where the feature has them: errors of two frames are independent."""
+        own = self.feature.deviation(clip)
+        if own is None:
+            return (None,) * len(self.config.streams)
+        # Signs do not matter to squares: the variance of a change is the sum of two.
+        both = change(own.square(), self.config.velocity_step, sign=1).sqrt()
+        return tuple(
+            {Stream.feature: own, Stream.velocity: both}.get(stream) for stream in self.config.streams
+        )
+
+    def _of_joints(self, stream: Stream, clip: Clip) -> Float[Tensor, "time features"]:
+        joints, names = clip.stream("joints"), clip.joint_names
+        upright = self.config.frame is BodyFrame.heading
+        match stream:
+            case Stream.places | Stream.place_velocity:
+                rows = joint_places(joints, names, upright).flatten(1)
+            case Stream.arms | Stream.arm_velocity:
+                rows = arm_places(joints, names, upright).flatten(1)
+            case Stream.distances:
+                rows = joint_distances(joints, names)
+            case _:
+                rows = travel(joints, names)
+        if rows.shape[1] == 0:
+            raise ValueError(
+                f"the stream {stream.value} needs more joints than {', '.join(joint_index(names))}, which the "
+                "skeletons have; leave it out of feature.streams"
+            )
+        return _whole_rows(rows)
+
+
+def change(rows: Float[Tensor, "time features"], step: int, sign: int = -1) -> Float[Tensor, "time features"]:
+    """What is `step` frames later less (`sign` 1: plus) what is `step` earlier; at the ends over those that there are.
+
+    A frame whose partner was lost counts as lost too.
+    """
+    frame = torch.arange(len(rows), device=rows.device)
+    return rows[(frame + step).clamp(max=len(rows) - 1)] + sign * rows[(frame - step).clamp(min=0)]
+
 
 def build_feature(config: FeatureConfig) -> Feature:
     """The feature that the configuration names."""
@@ -85,7 +183,7 @@ def build_feature(config: FeatureConfig) -> Feature:
             feature = ICAFeature(config)
         case FeatureKind.skeleton:
             feature = SkeletonFeature(config.frame)
-    return VelocityFeature(feature, config.velocity_step) if config.velocity_step else feature
+    return feature
 
 
 class JointAngleFeature(Feature):
@@ -96,6 +194,9 @@ class JointAngleFeature(Feature):
 
     def forward(self, clip: Clip) -> Float[Tensor, "time 20"]:
         return clip.stream("pose")[:, 4:]
+
+    def deviation(self, clip: Clip) -> Float[Tensor, "time 20"] | None:
+        return None if clip.pose_sd is None else clip.pose_sd[:, 4:]
 
 
 class LimbDirectionFeature(Feature):
@@ -180,30 +281,6 @@ class SkeletonFeature(Feature):
         upright = self.frame is BodyFrame.heading
         directions = bone_directions(clip.stream("joints"), clip.joint_names, upright)
         return _whole_rows(directions.flatten(1))
-
-
-class VelocityFeature(Feature):
-    """Another feature with its change over 2 x `step` frames appended; at the ends over those that there are.
-
-    A frame whose partner was lost counts as lost too.
-    """
-
-    def __init__(self, feature: Feature, step: int) -> None:
-        super().__init__()
-        if step < 1:
-            raise ValueError(f"the step of a velocity must be at least 1 frame, got {step}")
-        self.feature, self.step = feature, step
-
-    def fit(self, clips: Sequence[Clip], generator: torch.Generator) -> None:
-        """Fit the feature within."""
-        self.feature.fit(clips, generator)
-
-    def forward(self, clip: Clip) -> Float[Tensor, "time features"]:
-        values = self.feature(clip)
-        frame = torch.arange(len(values), device=values.device)
-        later = values[(frame + self.step).clamp(max=len(values) - 1)]
-        earlier = values[(frame - self.step).clamp(min=0)]
-        return torch.cat([values, later - earlier], dim=1)
 
 
 def _whole_rows(rows: Float[Tensor, "time features"]) -> Float[Tensor, "time features"]:

@@ -5,11 +5,14 @@ one) and `log_emission` log p(y_t | z_t), looked up already. Log-probabilities a
 observation has `log_emission` 0 in every state, which marginalises it. So has the padding behind a shorter
 sequence: the likelihood of the padded sequence is that of the sequence itself.
 
-Everything stays in the log domain: on a long sequence a left-to-right model leaves the range of scaled
-probabilities. The recursions run over the *bands* of the transition matrix, the moves by d states, that are
-possible at all: two for a left-to-right model of any size. Letters: T time, K states, D bands.
+The functions named `hmm_` stay in the log domain: on a long sequence a left-to-right model leaves the range
+of scaled probabilities. `likelihood_ratio` and `ForwardBackward` take plain probabilities, which is several
+times faster, and `exact_above` tells from their result where that was exact. The recursions run over the
+*bands* of the transition matrix, the moves by d states, that are possible at all: two for a left-to-right model
+of any size. Letters: T time, K states, D bands.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import reduce
 
@@ -139,6 +142,135 @@ def posteriors(
     arrival = torch.stack([_shift(arrival, -offset, dim=1) for offset in offsets], dim=1)
     pairs = (arrival.add_(log_alpha[:-1].unsqueeze(1)).add_(log_bands)).exp_()
     return log_likelihood, states, pairs
+
+
+def exact_above(dtype: torch.dtype) -> float:
+    """The least `likelihood_ratio` that plain probabilities get right to rounding.
+
+    With emissions of at most 1, all that follows a frame is a factor of at most 1. So a number that fell below the
+    smallest normal one, `tiny`, has lost no more than `tiny` of the result, which is rounding beside `tiny / eps`.
+    (Scaling each frame to a sum of 1 gives no such bound: the state that fell to zero may be the one that explains
+    the rest.)
+    """
+    limits = torch.finfo(dtype)
+    return limits.tiny / limits.eps
+
+
+def _mover(
+    offsets: tuple[int, ...],
+    bands: Float[Tensor, "bands states *#batch"],
+    origin: Float[Tensor, "frames states *batch"],
+    target: Float[Tensor, "frames states *batch"],
+) -> Callable[[int, int], None]:
+    """A function that moves `origin[i]` on by all moves into `target[j]`; all views are cut here, once.
+
+    It reads `bands` anew each time, but moves around from the last states to the first only if they are possible now.
+    """
+    states = bands.shape[1]
+    origins, targets = origin.unbind(), target.unbind()
+    pieces = []
+    for offset, band in zip(offsets, bands.unbind(), strict=True):
+        for start, end, length in ((0, offset, states - offset), (states - offset, 0, offset)):
+            weight = band.narrow(0, start, length)
+            if length and (start == 0 or bool(weight.any())):
+                sources = origin.narrow(1, start, length).unbind()
+                pieces.append((sources, target.narrow(1, end, length).unbind(), weight))
+    # The first piece may write instead of add where it fills all states.
+    stay = pieces.pop(0)[2] if offsets[0] == 0 else None
+
+    def by_bands(i: int, j: int) -> None:
+        if stay is None:
+            targets[j].zero_()
+        else:
+            torch.mul(origins[i], stay, out=targets[j])
+        for sources, ends, weight in pieces:
+            ends[j].addcmul_(sources[i], weight)
+
+    return by_bands
+
+
+def likelihood_ratio(
+    initial: Float[Tensor, "states *#batch"],
+    offsets: tuple[int, ...],
+    bands: Float[Tensor, "bands states *#batch"],
+    emission: Iterable[Tensor],
+) -> Float[Tensor, "*batch"]:
+    """p(y_1:T) over the product of the frames' greatest emissions, from probabilities, frame by frame.
+
+    `emission`, (states, *batch) a frame, is divided by that already: at most 1. Exact where the result is above
+    `exact_above`.
+    """
+    state = move = None
+    for time, seen in enumerate(emission):
+        now = time % 2
+        if state is None or move is None:
+            state = seen.new_empty(2, *seen.shape)
+            move = _mover(offsets, bands, state, state)
+            state[0] = initial
+        else:
+            move(1 - now, now)
+        state[now].mul_(seen)
+    if state is None:
+        raise ValueError("a sequence must have at least one frame, got emission with none")
+    return state[now].sum(0)
+
+
+class ForwardBackward:
+    """The smoother from plain probabilities, for one batch of sequences again and again, in the same memory.
+
+    Args:
+        offsets, bands: possible moves, and their probabilities (D, K, S); what is zero here stays zero.
+        time: frames.
+        inside: False on padding; none has any.
+    """
+
+    def __init__(
+        self,
+        offsets: tuple[int, ...],
+        bands: Float[Tensor, "bands states sequences"],
+        time: int,
+        inside: Bool[Tensor, "time sequences"] | None = None,
+    ) -> None:
+        _, states, sequences = bands.shape
+        self.offsets, self.inside = offsets, inside
+        # Forward and, with time and states counted from the last, backward, side by side: half the steps.
+        shape = (time, states, 2, sequences)
+        self.emission, self.predicted, self.updated = (bands.new_empty(shape) for _ in range(3))
+        self.bands = torch.stack([bands, _reversed_bands(offsets, bands)], dim=2)
+        self._move = _mover(offsets, self.bands, self.updated, self.predicted)
+        self._steps = list(
+            zip(self.predicted.unbind(), self.emission.unbind(), self.updated.unbind(), strict=True)
+        )
+
+    def __call__(
+        self,
+        initial: Float[Tensor, "states sequences"],
+        bands: Float[Tensor, "bands states sequences"],
+        emission: Float[Tensor, "time states sequences"],
+    ) -> tuple[
+        Float[Tensor, " sequences"],
+        Float[Tensor, "time states sequences"],
+        Float[Tensor, "bands states sequences"],
+    ]:
+        """Ratio as `likelihood_ratio`, p(z_t | y), and for each band the expected number of moves.
+
+        The posteriors are zero in frames that are not `inside`. Not finite where the ratio is zero.
+        """
+        self.bands[:, :, 0], self.bands[:, :, 1] = bands, _reversed_bands(self.offsets, bands)
+        self.emission[:, :, 0], self.emission[:, :, 1] = emission, emission.flip(0, 1)
+        self.predicted[0, :, 0], self.predicted[0, :, 1] = initial, 1
+        for time, (before, seen, after) in enumerate(self._steps):
+            if time > 0:
+                self._move(time - 1, time)
+            torch.mul(before, seen, out=after)
+
+        alpha = self.updated[:, :, 0]
+        ratio = alpha[-1].sum(0)
+        future = self.updated[:, :, 1].flip(0, 1).div_(ratio)  # p(y_t:T | z_t) / p(y)
+        if self.inside is not None:
+            future.mul_(self.inside.unsqueeze(1))
+        moves = [(alpha[:-1] * _shift(future[1:], -offset, dim=1)).sum(0) for offset in self.offsets]
+        return ratio, future.mul_(self.predicted[:, :, 0]), torch.stack(moves).mul_(bands)
 
 
 def _batch_last(

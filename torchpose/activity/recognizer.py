@@ -1,27 +1,31 @@
-"""The activity recogniser (T. 4.4): a feature, a codebook and an HMM per activity, from clips to activities.
+"""The activity recogniser (T. 4.4): features, codebooks and an HMM per activity, from clips to activities.
 
+Several streams are independent given the state. Several members, each with codebooks of its own, average their scores.
 Scores are log-likelihoods divided by the number of observed frames, nats per frame, so that long and short
-sequences compare.
+sequences compare. Letters: S sequences, T time, R streams, A activities, V symbols.
 """
 
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from omegaconf import OmegaConf
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from torchpose.activity.baum_welch import MISSING, BaumWelch, HMMConfig, Status
 from torchpose.activity.codebook import Codebook, CodebookConfig
 from torchpose.activity.dataset import Clip
-from torchpose.activity.features import FeatureConfig, build_feature
-from torchpose.activity.hmm import MISSING, BaumWelch, DiscreteHMM, HMMConfig, Status
+from torchpose.activity.features import FeatureConfig, FeatureStreams
+from torchpose.activity.hmm import DiscreteHMM
+from torchpose.activity.score_layer import LayerConfig, ScoreLayer
+from torchpose.activity.skeleton import mirror_joints
 from torchpose.atomic import replacing
 from torchpose.settings import compose_config
 
@@ -45,9 +49,18 @@ class RecognizerConfig:
     feature: FeatureConfig = field(default_factory=FeatureConfig)
     codebook: CodebookConfig = field(default_factory=CodebookConfig)
     hmm: HMMConfig = field(default_factory=HMMConfig)
+    layer: LayerConfig = field(default_factory=LayerConfig)
+    members: int = 1  # recognisers from different starts, whose scores are averaged
+    # Skeletons train with their mirror images, too: an activity is the same with the other hand. It must be.
+    mirror: bool = False
+    certainty: bool = False  # symbols count by how certain their features are, as the clips' deviations say
     # Reject a sequence whose best model beats the background by less, nats per frame; null never rejects.
     rejection_threshold: float | None = None
     seed: int = 0  # of the starts of ICA, codebook and models
+
+    def __post_init__(self) -> None:
+        if self.members < 1:
+            raise ValueError(f"members must be at least 1, got {self.members}; 3 to 5 make sense")
 
 
 @dataclass(frozen=True)
@@ -55,10 +68,12 @@ class Recognition:
     """What the sequences are (4.16). NaN: nothing was observed; for the odds, or no model is possible."""
 
     log_likelihood: Float[Tensor, "sequences activities"]  # nats per observed frame
-    activity: Int[Tensor, " sequences"]  # the most likely; -1: no answer
-    # The best score over the next best, nats per frame; infinite where there is no other activity.
+    # What decides: these, or the layer's log-probabilities where there is one, nats.
+    score: Float[Tensor, "sequences activities"]
+    activity: Int[Tensor, " sequences"]  # of the best score; -1: no answer
+    # The best score over the next best; infinite where there is no other activity.
     log_odds: Float[Tensor, " sequences"]
-    # The best over a background model, the shares of the symbols in all training frames; low: none of these.
+    # The best likelihood over a background model, the shares of the symbols in all training frames; low: none of these.
     log_odds_background: Float[Tensor, " sequences"]
     answer: Int[Tensor, " sequences"]  # `Answer`
 
@@ -94,6 +109,98 @@ class Evaluation:
         )
 
 
+@dataclass(frozen=True)
+class Symbols:
+    """The sequences as the HMMs see them; behind each one's length all is `MISSING`."""
+
+    values: Int[Tensor, "sequences time streams"]
+    weights: Float[Tensor, "sequences time streams"] | None
+    lengths: Int[Tensor, " sequences"]
+
+    @property
+    def seen(self) -> Bool[Tensor, "sequences time"]:
+        """Frames with a symbol in some stream."""
+        return (self.values != MISSING).any(2)
+
+    def of(self, sequences: Tensor) -> "Symbols":
+        """Some of them."""
+        weights = None if self.weights is None else self.weights[sequences]
+        return Symbols(self.values[sequences], weights, self.lengths[sequences])
+
+
+Rows = tuple[Tensor, ...]  # one clip's streams
+Deviations = tuple[Tensor | None, ...]
+
+
+class Member(nn.Module):
+    """A codebook for each stream, a bank of HMMs on their symbols, and a background model of the symbols alone."""
+
+    log_background: Float[Tensor, "streams symbols"]
+
+    def __init__(self, config: RecognizerConfig, activities: int) -> None:
+        super().__init__()
+        streams, size = len(config.feature.streams), config.codebook.size
+        self.config = config
+        self.codebooks = nn.ModuleList(Codebook(config.codebook) for _ in range(streams))
+        self.hmm = DiscreteHMM(activities, size, config.hmm, streams=(streams,))
+        self.register_buffer("log_background", torch.zeros_like(self.hmm.log_emission[0, :, 0]))
+
+    def fit_codebooks(self, rows: Sequence[Rows], generator: torch.Generator) -> None:
+        """Learn the symbols of each stream from all frames of all clips."""
+        for stream, codebook in enumerate(self._codebooks):
+            codebook.fit(torch.cat([clip[stream] for clip in rows]), generator)
+
+    def encode(self, rows: Sequence[Rows], deviations: Sequence[Deviations] | None) -> Symbols:
+        """The clips' symbols, padded, and, where their deviations are known, how certain these are."""
+        lengths = [len(clip[0]) for clip in rows]
+        symbols = self._padded(
+            [codebook(torch.cat([clip[r] for clip in rows])) for r, codebook in enumerate(self._codebooks)],
+            lengths,
+            MISSING,
+        )
+        weights = None
+        if deviations is not None:
+            certain = []
+            for r, codebook in enumerate(self._codebooks):
+                parts = [
+                    torch.ones(n) if (sd := clip[r]) is None else codebook.certainty(sd).cpu()
+                    for clip, n in zip(deviations, lengths, strict=True)
+                ]
+                certain.append(torch.cat(parts).to(self.hmm.log_emission))
+            weights = self._padded(certain, lengths, 0)
+        return Symbols(symbols, weights, torch.tensor(lengths, device=symbols.device))
+
+    def fit_models(
+        self, symbols: Symbols, labels: Int[Tensor, " sequences"], generator: torch.Generator
+    ) -> BaumWelch:
+        """Train the HMM of each activity, and the background model on all."""
+        training = self.hmm.fit(symbols.values, symbols.lengths, labels, generator, symbols.weights)
+        counts = [
+            stream[stream != MISSING].bincount(minlength=self.hmm.num_symbols)
+            for stream in symbols.values.unbind(2)
+        ]
+        smoothed = torch.stack(counts) + (self.config.hmm.emission_prior - 1)
+        self.log_background = (smoothed / smoothed.sum(1, keepdim=True)).log().to(self.hmm.log_emission)
+        return training
+
+    def background(self, symbols: Symbols) -> Float[Tensor, " sequences"]:
+        """Log-likelihood of each sequence if its symbols came in no order."""
+        stream = torch.arange(symbols.values.shape[2], device=symbols.values.device)
+        scores = self.log_background[stream, symbols.values.clamp(min=0)]
+        if symbols.weights is not None:
+            scores = scores * symbols.weights
+        return torch.where(symbols.values != MISSING, scores, 0.0).flatten(1).sum(1)
+
+    @property
+    def _codebooks(self) -> list[Codebook]:
+        return [codebook for codebook in self.codebooks if isinstance(codebook, Codebook)]
+
+    @staticmethod
+    def _padded(streams: list[Tensor], lengths: list[int], padding: int) -> Tensor:
+        parts = torch.stack(streams, dim=1).split(lengths)
+        return nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=padding)
+
+
 class Recognizer(nn.Module):
     """Clips in, activities out; the clips' tensors and the module are on one device.
 
@@ -101,18 +208,18 @@ class Recognizer(nn.Module):
     >>> recognizer(clips).activity
     """
 
-    log_background: Float[Tensor, " symbols"]
-
     def __init__(self, config: RecognizerConfig = RecognizerConfig(), activities: Sequence[str] = ()) -> None:
         """`activities` may be left to `fit`, which then takes those of its clips in alphabetical order."""
         super().__init__()
         self.config = config
         self.activities = tuple(activities)
-        self.fitted: BaumWelch | None = None  # the course of the last fit
-        self.feature = build_feature(config.feature)
-        self.codebook = Codebook(config.codebook)
-        self.hmm = DiscreteHMM(max(len(self.activities), 1), config.codebook.size, config.hmm)
-        self.register_buffer("log_background", torch.zeros_like(self.hmm.log_emission[0, 0]))
+        self.fitted: tuple[BaumWelch, ...] = ()  # the course of the last fit, of each member
+        self.feature = FeatureStreams(config.feature)
+        self._build(max(len(self.activities), 1))
+
+    def _build(self, activities: int) -> None:
+        self.members = nn.ModuleList(Member(self.config, activities) for _ in range(self.config.members))
+        self.layer = ScoreLayer(activities, self.config.layer) if self.config.layer.enabled else None
 
     @torch.no_grad()
     def fit(self, clips: Sequence[Clip]) -> "Recognizer":
@@ -129,25 +236,83 @@ class Recognizer(nn.Module):
         if untaught:
             raise ValueError(f"every activity needs a training clip, got none for {', '.join(untaught)}")
 
+        own = len(clips)
+        subjects = [clip.subject for clip in clips]
+        if self.config.mirror:
+            clips = [*clips, *map(_mirrored, clips)]
+            labels = labels.repeat(2)
         generator = torch.Generator().manual_seed(self.config.seed)
         self.feature.fit(clips, generator)
-        features = [self.feature(clip) for clip in clips]
-        self.codebook.fit(torch.cat(features), generator)
-        symbols, lengths = self._symbols(features)
-        device = symbols.device
-        self.hmm = DiscreteHMM(len(activities), self.config.codebook.size, self.config.hmm).to(device)
-        training = self.hmm.fit(symbols, lengths, labels.to(device), generator)
-        status = training.status.tolist()
-        empty = [name for name, end in zip(activities, status, strict=True) if end == Status.NO_DATA]
-        if empty:
-            raise ValueError(
-                f"every activity needs frames in which the person was seen, got none for {', '.join(empty)}"
-            )
-        self.activities, self.fitted = activities, training
-        counts = symbols[symbols != MISSING].bincount(minlength=self.config.codebook.size)
-        counts = counts + (self.config.hmm.emission_prior - 1)
-        self.log_background = (counts / counts.sum()).log().to(self.hmm.log_emission)
+        rows, deviations = self._observe(clips)
+        device = rows[0][0].device
+        labels = labels.to(device)
+        self._build(len(activities))
+        self.to(device)
+        courses, encoded = [], []
+        for member in self._members:
+            member.fit_codebooks(rows, generator)
+            symbols = member.encode(rows, deviations)
+            training = member.fit_models(symbols, labels, generator)
+            status = training.status.tolist()
+            empty = [name for name, end in zip(activities, status, strict=True) if end == Status.NO_DATA]
+            if empty:
+                raise ValueError(
+                    f"every activity needs frames in which the person was seen, got none for {', '.join(empty)}"
+                )
+            courses.append(training)
+            encoded.append(symbols)
+        self.activities, self.fitted = activities, tuple(courses)
+        if self.layer is not None:
+            self._fit_layer(self.layer, encoded, labels, subjects, own)
         return self
+
+    def _fit_layer(
+        self, layer: ScoreLayer, encoded: list[Symbols], labels: Tensor, subjects: list[str], own: int
+    ) -> None:
+        """Learn the layer from the scores of models that have not seen the subject; the codebooks have, but no label.
+
+        What is held out are the `own` clips; their mirror images are held out with them, and only train.
+        """
+        people = sorted(set(subjects))
+        # Of a single subject the sequences are held out instead.
+        group = [people.index(name) for name in subjects] if len(people) > 1 else list(range(own))
+        fold = torch.tensor(group, device=labels.device) % self.config.layer.folds
+        of_all = fold.repeat(len(labels) // own)
+        scores, known = [], []
+        for number in fold.unique().tolist():
+            train, test = (of_all != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]
+            of_members = []
+            for member, symbols in zip(self._members, encoded, strict=True):
+                generator = torch.Generator().manual_seed(self.config.seed)
+                bank = DiscreteHMM(
+                    len(self.activities),
+                    member.hmm.num_symbols,
+                    self.config.hmm,
+                    streams=symbols.values.shape[2:],
+                ).to(labels.device)
+                seen, asked = symbols.of(train), symbols.of(test)
+                bank.fit(seen.values, seen.lengths, labels[train], generator, seen.weights)
+                of_members.append(_per_frame(bank, asked))
+            found = torch.stack(of_members).mean(0)
+            # An activity that nobody else did has no model here.
+            taught = torch.isin(labels[:own][test], labels[train]) & ~found.isnan().any(1)
+            scores.append(found[taught])
+            known.append(labels[:own][test][taught])
+        held_out, truth = torch.cat(scores), torch.cat(known)
+        if len(truth) == 0:
+            raise ValueError(
+                "the layer needs activities that several subjects did, got none; give more sequences or set "
+                "layer.enabled=false"
+            )
+        layer.fit(held_out, truth)
+
+    def _observe(self, clips: Sequence[Clip]) -> tuple[list[Rows], list[Deviations] | None]:
+        deviations = [self.feature.deviation(clip) for clip in clips] if self.config.certainty else None
+        return [self.feature(clip) for clip in clips], deviations
+
+    @property
+    def _members(self) -> list[Member]:
+        return [member for member in self.members if isinstance(member, Member)]
 
     @torch.no_grad()
     def forward(self, clips: Sequence[Clip]) -> Recognition:
@@ -156,23 +321,26 @@ class Recognizer(nn.Module):
             raise ValueError("the recogniser has not learned any activity; call fit or load first")
         if not clips:
             raise ValueError("give at least one clip to recognise, got none")
-        symbols, lengths = self._symbols([self.feature(clip) for clip in clips])
-        seen = symbols != MISSING
-        frames = seen.sum(1)
-        per_frame = torch.where(frames > 0, frames, torch.nan).to(self.log_background)
-        scores = self.hmm.log_likelihood(symbols, lengths) / per_frame[:, None]
-        background = torch.where(seen, self.log_background[symbols.clamp(min=0)], 0.0).sum(1) / per_frame
+        rows, deviations = self._observe(clips)
+        likelihoods, backgrounds = [], []
+        for member in self._members:
+            symbols = member.encode(rows, deviations)
+            likelihoods.append(_per_frame(member.hmm, symbols))
+            backgrounds.append(member.background(symbols) / _frames(symbols))
+        likelihood, background = torch.stack(likelihoods).mean(0), torch.stack(backgrounds).mean(0)
+        scores = likelihood if self.layer is None else self.layer(likelihood)
 
         best, activity = scores.max(1)
         others = scores.scatter(1, activity[:, None], -torch.inf)
-        over_background = best - background
+        over_background = likelihood.amax(1) - background
         answer = torch.full_like(activity, int(Answer.RECOGNIZED))
         if self.config.rejection_threshold is not None:
             answer[over_background < self.config.rejection_threshold] = int(Answer.REJECTED)
-        answer[torch.isneginf(best)] = int(Answer.IMPOSSIBLE)
-        answer[frames == 0] = int(Answer.UNOBSERVED)
+        answer[torch.isneginf(likelihood).all(1)] = int(Answer.IMPOSSIBLE)
+        answer[likelihood.isnan().any(1)] = int(Answer.UNOBSERVED)
         return Recognition(
-            log_likelihood=scores,
+            log_likelihood=likelihood,
+            score=scores,
             activity=torch.where(answer == int(Answer.RECOGNIZED), activity, NO_ACTIVITY),
             log_odds=best - others.amax(1),
             log_odds_background=over_background,
@@ -235,14 +403,21 @@ class Recognizer(nn.Module):
             setattr(recognizer.get_submodule(owner), buffer, value)
         return recognizer
 
-    def _symbols(
-        self, features: list[Tensor]
-    ) -> tuple[Int[Tensor, "sequences time"], Int[Tensor, " sequences"]]:
-        """Symbols of all sequences, padded, and their lengths."""
-        lengths = [len(rows) for rows in features]
-        symbols = self.codebook(torch.cat(features)).split(lengths)
-        padded = nn.utils.rnn.pad_sequence(list(symbols), batch_first=True, padding_value=MISSING)
-        return padded, torch.tensor(lengths, device=padded.device)
+
+def _frames(symbols: Symbols) -> Float[Tensor, " sequences"]:
+    """Observed frames; NaN for none."""
+    frames = symbols.seen.sum(1)
+    return torch.where(frames > 0, frames, torch.nan)
+
+
+def _per_frame(bank: DiscreteHMM, symbols: Symbols) -> Float[Tensor, "sequences activities"]:
+    return bank.log_likelihood(symbols.values, symbols.lengths, symbols.weights) / _frames(symbols)[:, None]
+
+
+def _mirrored(clip: Clip) -> Clip:
+    if clip.joints is None:
+        raise ValueError(f"mirror needs joint positions in every clip, got none in {clip}; set mirror=false")
+    return replace(clip, joints=mirror_joints(clip.joints, clip.joint_names))
 
 
 def _digest(text: str) -> str:
