@@ -169,7 +169,13 @@ class People:
         masks = split_people(
             view.silhouette[0], view.depth[0], self.model.camera, None, self.config.partition
         )
-        return self.model.eyes.sight(view, masks, None) if len(masks) == 1 else None
+        if len(masks) != 1:
+            return None
+        sight, scene = self.model.eyes.sight(view, masks, None), self.model.eyes.background_depth
+        if sight.present and scene is not None:
+            nearest = float(sight.cloud.points[0][sight.cloud.mask[0], 2].median()) - self.config.before
+            sight = replace(sight, cut=sight.cut or _touching(sight, (scene < nearest)[None]))
+        return sight
 
     def __call__(self, recording: Recording) -> Iterator[list[FramePose]]:
         """Smoothed poses of a prepared recording's frames, in order: those of everybody who was there so far."""
@@ -363,10 +369,8 @@ class People:
         """A first size from frames that show all of the person, until frames with poses tell it better."""
         if follower.sized or sight.cut or self.model.config.height:
             return
-        if covered is not None:
-            near = max_pool2d(sight.silhouette.to(sight.depth), 2 * TOUCHING + 1, 1, TOUCHING) > 0
-            if bool((near & covered).any()):
-                return
+        if covered is not None and _touching(sight, covered):
+            return
         follower.extents.append(upright_extent(sight))
         if len(follower.extents) >= WHOLE:
             height = follower.model.height_of(follower.extents)
@@ -513,6 +517,12 @@ class People:
         self.followers += [Follower(self.model.another(), sized=False) for _ in states[1:]]
         for follower, state in zip(self.followers, states, strict=True):
             follower.restore(state)
+
+
+def _touching(sight: Sight, covered: Bool[Tensor, "1 height width"]) -> bool:
+    """Whether what may hide somebody is so near to what is seen that it may hide a part."""
+    near = max_pool2d(sight.silhouette.to(sight.depth), 2 * TOUCHING + 1, 1, TOUCHING) > 0
+    return bool((near & covered).any())
 
 
 def _at_border(mask: Bool[Tensor, "height width"]) -> bool:

@@ -47,6 +47,7 @@ from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import CellConfig, group_cells
 
 RIM = 0.03  # m by which a cloud falls short of a person: half a step of its grid at the head and at the feet
+WHOLE_SIGHTS = 2  # of all of somebody, that tell the size
 LEAST_UPRIGHT = 0.83  # of the body file's height; whoever looks shorter sits or stoops
 
 
@@ -157,7 +158,7 @@ class StereoToPose(nn.Module):
         """Learn the recording's empty scene and the person's size and colours, and forget any other person.
 
         `glance` says whom a frame shows, None where that is not clear; without it the largest silhouette is the
-        person's. Returns whether anybody was seen whole.
+        person's. Returns whether somebody was seen whole often enough to tell the size.
         """
         known = read_size(Path(self.config.person), self.body) if self.config.person else None
         self.learn_background(recording)
@@ -169,7 +170,7 @@ class StereoToPose(nn.Module):
         sights = [sight for sight in map(look, frames) if sight is not None]
         with self.stopwatch.measure("size"):
             self.size = self.measure_size(sights, known)
-        return any(sight.present and not sight.cut for sight in sights)
+        return sum(sight.present and not sight.cut for sight in sights) >= WHOLE_SIGHTS
 
     def measure_size(
         self, sights: list[Sight], known: Float[Tensor, "1 sizes"] | None = None
@@ -186,11 +187,12 @@ class StereoToPose(nn.Module):
             return size
         self.colour.forget()
         fits = []
-        for sight in sights:
-            if sight.present:
-                found = self.tracker.starter(self.observe(sight), sight.faces, size)
-                if self.tracker.acceptable(found):
-                    fits.append((sight, found))
+        present = [sight for sight in sights if sight.present]
+        # Who is half hidden misleads the proportions.
+        for sight in [sight for sight in present if not sight.cut] or present:
+            found = self.tracker.starter(self.observe(sight), sight.faces, size)
+            if self.tracker.acceptable(found):
+                fits.append((sight, found))
         if not fits:
             return size
         for sight, found in fits:
