@@ -38,8 +38,8 @@ class SmoothingConfig:
     rest_time: float = 2.0  # s after which an unseen limb forgets where it was
     # Of what all points of a part have in common, in all frames: m by which they may be off across it and along it, as
     # surface, joints and borders are not quite the person's. It says how sure the poses are and does not move them.
-    offset_sd: float = 0.01
-    slide_sd: float = 0.02
+    offset_sd: float = 0.015
+    slide_sd: float = 0.03
     piece: float = 3.0  # times as much for a piece of a part as for all of it
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
 
