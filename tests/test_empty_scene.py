@@ -12,6 +12,7 @@ from torchpose.vision.empty_scene import (
     find_people,
     learn_empty_scene,
     room_planes,
+    stands_in_background,
 )
 
 HEIGHT, WIDTH = 120, 160
@@ -108,7 +109,7 @@ class TrueDisparity(StereoMatcher):
         self.answers = list(answers)
 
     def match(self, task):
-        values = self.answers.pop(0)[None]
+        values = self.answers.pop(0).float()[None]
         return Disparity(values, torch.ones_like(values))
 
 
@@ -150,3 +151,28 @@ def test_the_scene_is_what_the_frames_show_behind_the_person():
 def test_bad_settings_are_named(setting, message):
     with pytest.raises(ValueError, match=message):
         EmptySceneConfig(**setting)
+
+
+def stands(background, disparity):
+    """`stands_in_background` of a matcher that finds these disparities, of images that do not matter."""
+    empty, shown = torch.rand(1, 3, HEIGHT, WIDTH), torch.rand(5, 3, HEIGHT, WIDTH)
+    matcher = TrueDisparity([*background, *disparity])
+    return stands_in_background((empty, empty), (shown, shown), matcher, CAMERA, (0, 20), CONFIG)
+
+
+def test_somebody_in_the_background_is_told_by_frames_that_see_behind():
+    walks = torch.stack([rectangle(25, 10 + 30 * k, 75, 20) for k in range(5)])
+    disparity = torch.where(walks, 9.0, room()) + 0.05 * torch.randn(5, HEIGHT, WIDTH)
+    occupied = torch.where(rectangle(25, 60, 75, 20), 9.0, room())[None]
+    with pytest.warns(UserWarning, match="stands in the background that the recording sees behind"):
+        assert stands(occupied, disparity)
+
+
+def test_an_empty_background_and_furniture_that_stays_warn_of_nobody(recwarn):
+    walks = torch.stack([rectangle(25, 10 + 30 * k, 75, 20) for k in range(5)])
+    furnished = torch.where(rectangle(40, 20, 60, 30), 7.0, room())
+    disparity = torch.where(walks, 9.0, furnished) + 0.05 * torch.randn(5, HEIGHT, WIDTH)
+    assert not stands(furnished[None], disparity)
+    cup = torch.where(rectangle(90, 100, 8, 5), 9.0, furnished)  # taken away since
+    assert not stands(cup[None], disparity)
+    assert not recwarn.list

@@ -35,6 +35,7 @@ from torchpose.vision.empty_scene import (
     clear_depth,
     empty_depth,
     learn_empty_scene,
+    stands_in_background,
 )
 from torchpose.vision.faces import FaceConfig, FaceDetector, FaceMemory, Faces
 from torchpose.vision.growing_seeds import GrowingSeeds
@@ -46,6 +47,7 @@ from torchpose.vision.skin import SkinModel
 from torchpose.vision.stereo import StereoConfig, stereo_matcher
 from torchpose.vision.windows import window_max
 
+GLANCES = 5  # frames of the recording that see whether somebody stands in its background
 SURE = 3.0  # log-odds of a depth reading that is nobody's noise
 PURE = 0.75  # share of a depth reading that must be the person's: with less it lies behind the body's surface
 NOBODY = -1e3  # log-odds of a pixel that has been given to somebody
@@ -219,31 +221,35 @@ class Eyes(nn.Module):
             self.background = DepthBackground(depth.to(device), config)
             self.background_depth = self.background.depth
             return
-        if backgrounds.left is not None and backgrounds.right is not None:
-            left, right = backgrounds.left.to(device), backgrounds.right.to(device)
+        span, rules = (0, self.disparity_range[1]), self.config.empty_scene
+        left, right = backgrounds.left, backgrounds.right
+        if left is not None and right is not None:
+            left, right = left.to(device), right.to(device)
+            some = self._pairs(recording, spread_positions(len(recording), GLANCES), device)
+            with self.stopwatch.measure("background"):
+                if stands_in_background((left, right), some, self.stereo, self.camera, span, rules):
+                    left = right = None
+        if left is not None and right is not None:
             with self.stopwatch.measure("background"):
                 pair = left.median(0, keepdim=True).values, right.median(0, keepdim=True).values
-                disparity = self.stereo(*pair, disparity_range=(0, self.disparity_range[1])).values[0]
+                disparity = self.stereo(*pair, disparity_range=span).values[0]
         else:
-            frames = list(readable_frames(recording, spread))
-            left, right = (
-                _stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right")
-            )
+            pairs = self._pairs(recording, spread, device)
             with self.stopwatch.measure("background"):
-                scene = learn_empty_scene(
-                    left,
-                    right,
-                    self.stereo,
-                    self.camera,
-                    (0, self.disparity_range[1]),
-                    self.config.empty_scene,
-                )
+                scene = learn_empty_scene(*pairs, self.stereo, self.camera, span, rules)
             left, right, disparity = scene.left, scene.right, scene.disparity
         disparity = bridge_gaps(disparity)  # a bare wall and a glaring floor match nowhere but at their rims
         self.background = BackgroundModel(left, self.config.background)
         self.background_depth = self.camera.depth(disparity)
         empty = rgb_to_grayscale(torch.stack([temporal_median(left), temporal_median(right)]))[:, 0]
         self.scene_match = SceneMatch(empty[0], empty[1], disparity, self.config.scene_match)
+
+    @staticmethod
+    def _pairs(recording: Recording, positions: list[int], device: torch.device) -> tuple[Tensor, Tensor]:
+        """Left and right images of some frames, (T, 3, H, W) each."""
+        frames = list(readable_frames(recording, positions))
+        left, right = (_stack([getattr(f, side) for f in frames]).to(device) for side in ("left", "right"))
+        return left, right
 
     def state(self) -> dict[str, Tensor]:
         """What is remembered of the last frame, to go on from there; {} if there was none."""

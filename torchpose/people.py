@@ -41,6 +41,9 @@ from torchpose.window import PeopleWindows
 
 WALK = 0.8  # s over which somebody's way is measured
 TOUCHING = 3  # px between somebody and what may hide a part
+HIDING = (
+    1.2  # of the root of somebody's pixels, beside which something nearer stands; fewer are noise and floor
+)
 WHOLE = 3  # frames that show all of somebody, from which the height is taken: legs that stride are short
 FACE_TO_HEAD = (0.0, -0.06, 0.08)  # m, from a face's surface to the head's centre, as measured on `people`
 
@@ -118,7 +121,7 @@ class Follower:
         """What the next frame starts from, as tensors."""
         numbers = torch.tensor([self.seen, self.known, self.sized, self.face_time], dtype=torch.float64)
         state = self.model.state() | {"follower": numbers}
-        state |= {"trail": self.trail}
+        state |= {"trail": self.trail, "extents": torch.tensor(self.extents, dtype=torch.float64)}
         state |= {f"location_{name}": value for name, value in self.location.state().items()}
         if self.clothes is not None:
             state["clothes"] = self.clothes
@@ -139,7 +142,7 @@ class Follower:
             if name.startswith("location_")
         }
         self.location = Location.restore(where)
-        self.trail = state["trail"]
+        self.trail, self.extents = state["trail"], state["extents"].tolist()
         self.clothes = state["clothes"].to(like) if "clothes" in state else None
         self.face = None
         if "face" in state:
@@ -164,18 +167,15 @@ class People:
         self.followers = [Follower(self.model, sized=seen or bool(self.model.config.person))]
 
     def _alone(self, frame: Frame) -> Sight | None:
-        """Whoever is in a frame with nobody else."""
+        """Whoever is in a frame with nobody else, and with nothing before."""
         view = self.model.eyes.look(frame, self.model.device)
         masks = split_people(
             view.silhouette[0], view.depth[0], self.model.camera, None, self.config.partition
         )
         if len(masks) != 1:
             return None
-        sight, scene = self.model.eyes.sight(view, masks, None), self.model.eyes.background_depth
-        if sight.present and scene is not None:
-            nearest = float(sight.cloud.points[0][sight.cloud.mask[0], 2].median()) - self.config.before
-            sight = replace(sight, cut=sight.cut or _touching(sight, (scene < nearest)[None]))
-        return sight
+        sight = self.model.eyes.sight(view, masks, None)
+        return None if self._half_hidden(sight, view) else sight
 
     def __call__(self, recording: Recording) -> Iterator[list[FramePose]]:
         """Smoothed poses of a prepared recording's frames, in order: those of everybody who was there so far."""
@@ -225,7 +225,7 @@ class People:
                 follower.known |= there and arrived
                 observation = None
                 if sight is not None and there:
-                    self._measure_height(follower, sight, cover)
+                    self._measure_height(follower, sight, view)
                 if sight is not None and there and (arrived or follower.known):
                     observation = follower.model.observe(sight, cover)
                 cut = sight is not None and (sight.cut or self._partly(body, cover))
@@ -363,18 +363,25 @@ class People:
                 best, least = k, strange
         return best
 
-    def _measure_height(
-        self, follower: Follower, sight: Sight, covered: Bool[Tensor, "1 height width"] | None
-    ) -> None:
+    def _measure_height(self, follower: Follower, sight: Sight, view: View) -> None:
         """A first size from frames that show all of the person, until frames with poses tell it better."""
-        if follower.sized or sight.cut or self.model.config.height:
-            return
-        if covered is not None and _touching(sight, covered):
+        if follower.sized or sight.cut or self.model.config.height or self._half_hidden(sight, view):
             return
         follower.extents.append(upright_extent(sight))
         if len(follower.extents) >= WHOLE:
             height = follower.model.height_of(follower.extents)
             follower.model.size = self.model.body.size_of_height(height)
+
+    def _half_hidden(self, sight: Sight, view: View) -> bool:
+        """Whether something stands before what is seen of somebody, and beside it in the image."""
+        own = sight.silhouette
+        depth = torch.where(own, view.depth.nan_to_num(0.0), 0.0)
+        beside = max_pool2d(depth, 2 * TOUCHING + 1, 1, TOUCHING)
+        front = view.depth.nan_to_num(nan=torch.inf)
+        if self.model.eyes.background_depth is not None:
+            front = torch.minimum(front, self.model.eyes.background_depth.nan_to_num(nan=torch.inf))
+        hides = ~own & (beside > 0) & (front < beside - self.config.before)
+        return int(hides.sum()) > HIDING * int(own.sum()) ** 0.5
 
     def _face(self, follower: Follower, time_s: float) -> FaceMemory | None:
         recent = 0 < time_s - follower.face_time < self.model.eyes.config.memory
@@ -517,12 +524,6 @@ class People:
         self.followers += [Follower(self.model.another(), sized=False) for _ in states[1:]]
         for follower, state in zip(self.followers, states, strict=True):
             follower.restore(state)
-
-
-def _touching(sight: Sight, covered: Bool[Tensor, "1 height width"]) -> bool:
-    """Whether what may hide somebody is so near to what is seen that it may hide a part."""
-    near = max_pool2d(sight.silhouette.to(sight.depth), 2 * TOUCHING + 1, 1, TOUCHING) > 0
-    return bool((near & covered).any())
 
 
 def _at_border(mask: Bool[Tensor, "height width"]) -> bool:

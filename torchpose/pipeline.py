@@ -187,12 +187,11 @@ class StereoToPose(nn.Module):
             return size
         self.colour.forget()
         fits = []
-        present = [sight for sight in sights if sight.present]
-        # Who is half hidden misleads the proportions.
-        for sight in [sight for sight in present if not sight.cut] or present:
-            found = self.tracker.starter(self.observe(sight), sight.faces, size)
-            if self.tracker.acceptable(found):
-                fits.append((sight, found))
+        for sight in sights:
+            if sight.present:
+                found = self.tracker.starter(self.observe(sight), sight.faces, size)
+                if self.tracker.acceptable(found):
+                    fits.append((sight, found))
         if not fits:
             return size
         for sight, found in fits:

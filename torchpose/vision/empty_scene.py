@@ -83,13 +83,7 @@ def learn_empty_scene(
     Where nobody moves, the tallest thing of a person's height that stands out of the room is taken for a person, with
     a warning.
     """
-    size = (left.shape[2] // config.shrink, left.shape[3] // config.shrink)
-    least, greatest = disparity_range[0] // config.shrink, -(-disparity_range[1] // config.shrink)
-    found = []
-    for images in zip(left, right, strict=True):  # one by one: a batch's volume of all disparities is large
-        small = [F.interpolate(image[None], size, mode="area") for image in images]
-        found.append(matcher(small[0], small[1], disparity_range=(least, greatest)).values)
-    disparity = torch.cat(found)
+    disparity = _small_disparity(left, right, matcher, disparity_range, config)
     people = find_people(disparity, camera.scaled(1 / config.shrink), config)
     hidden = [_enlarge(mask, left) for mask in (people, _in_right_image(people, disparity))]
     shown = [
@@ -102,6 +96,51 @@ def learn_empty_scene(
     scene = matcher(pair[0], pair[1], disparity_range=disparity_range).values[0]
     trusted = window_min(seen.to(scene.dtype), config.fattening) > 0
     return EmptyScene(shown[0], shown[1], continue_rows(scene, trusted), seen)
+
+
+def stands_in_background(
+    empty: tuple[Tensor, Tensor],
+    frames: tuple[Tensor, Tensor],
+    matcher: StereoMatcher,
+    camera: StereoCamera,
+    disparity_range: tuple[int, int],
+    config: EmptySceneConfig = EmptySceneConfig(),
+) -> bool:
+    """Whether somebody stands in the stereo pairs that should show the empty scene; warns of it.
+
+    Who does is nearer there than what frames, spread over the recording, see behind; both are left and right images,
+    (T, 3, H, W) each, RGB in [0, 1].
+    """
+    background, seen = (
+        _small_disparity(left, right, matcher, disparity_range, config) for left, right in (empty, frames)
+    )
+    far = seen.nanquantile(config.far_share, dim=0)
+    nearer = window_min((background > far + config.step).to(background.dtype), 1) > 0
+    if not _tallest(nearer, background, camera.scaled(1 / config.shrink), config).any():
+        return False
+    warnings.warn(
+        "somebody or something stands in the background that the recording sees behind; the empty scene is taken "
+        "from the recording instead; record the empty scene anew into its folder background/",
+        stacklevel=2,
+    )
+    return True
+
+
+def _small_disparity(
+    left: Frames,
+    right: Frames,
+    matcher: StereoMatcher,
+    disparity_range: tuple[int, int],
+    config: EmptySceneConfig,
+) -> Planes:
+    """Disparities of shrunken pairs, px of these."""
+    size = (left.shape[2] // config.shrink, left.shape[3] // config.shrink)
+    least, greatest = disparity_range[0] // config.shrink, -(-disparity_range[1] // config.shrink)
+    found = []
+    for images in zip(left, right, strict=True):  # one by one: a batch's volume of all disparities is large
+        small = [F.interpolate(image[None], size, mode="area") for image in images]
+        found.append(matcher(small[0], small[1], disparity_range=(least, greatest)).values)
+    return torch.cat(found)
 
 
 def empty_depth(
