@@ -38,9 +38,9 @@ class SmoothingConfig:
     rest_time: float = 2.0  # s after which an unseen limb forgets where it was
     # Of what all points of a part have in common, in all frames: m by which they may be off across it and along it, as
     # surface, joints and borders are not quite the person's. It says how sure the poses are and does not move them.
-    offset_sd: float = 0.015
-    slide_sd: float = 0.03
-    piece: float = 3.0  # times as much for a piece of a part as for all of it
+    offset_sd: float = 0.008
+    slide_sd: float = 0.02
+    piece: float = 6.0  # times as much for a piece of a part as for all of it
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
 
     def __post_init__(self) -> None:
@@ -268,7 +268,9 @@ class Smoother(nn.Module):
         # A part's long axis is its last. What a whole part's points have in common the sizes have taken up; where only
         # a piece of it shows, its points may be off by more.
         across, along = self.config.offset_sd, self.config.slide_sd
-        more = 1 + (self.config.piece - 1) * (1 - equations.of_rows.extent(posed).clamp_max(1))
+        more = (
+            1 + (self.config.piece - 1) * (1 - equations.of_rows.extent(posed).clamp_max(1).sqrt()).square()
+        )
         sd = more[..., None] * pose.new_tensor([across, across, along])
         pushed = torch.where(sound, pushed * sd.flatten(1)[:, None], 0.0)
         followed, own, _ = solve_chain(blocks, -chain.pull, pushed)
