@@ -64,6 +64,7 @@ class PoseConfig:
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them
     height: float = 0.0  # m, of the person; 0 measures it
+    least_height: float = 1.75  # m, below which no measured height is believed: legs may be hidden
     size: SizeConfig = field(default_factory=SizeConfig)
     size_frames: int = 4  # of the recording, from which height and proportions are measured
     cells: CellConfig = field(default_factory=CellConfig)  # of the geodesic term
@@ -222,7 +223,7 @@ class StereoToPose(nn.Module):
             return self.body.height
         # The cloud's rim lies half a grid step inside the silhouette, at the head and at the feet.
         measured = heights[-2] if len(heights) > 2 else heights[-1]
-        return min(max(measured + 0.03, 0.95 * self.body.height), 1.2 * self.body.height)
+        return min(max(measured + 0.03, self.config.least_height), 1.2 * self.body.height)
 
     def forward(self, recording: Recording) -> Iterator[FramePose]:
         """Poses of a prepared recording's frames, in order and smoothed."""
