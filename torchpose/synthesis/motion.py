@@ -400,7 +400,7 @@ def perform(
     if motion not in _ACTS:
         raise ValueError(f"the motion must be one of {', '.join(MOTIONS)}, got {motion!r}")
     asked, usual = len(times), torch.arange(0.0, _USUAL, 0.1)
-    times = torch.cat([times.to(size), usual.to(size)])  # the place does not depend on the times that are asked for
+    times = torch.cat([times.to(size), usual.to(size)])  # the place must not depend on what is asked for
     style, draw = Draw("style", motion, person), Draw("take", motion, person, take)
     place = Draw("place", person, take, motion)
     figure = _ACTS[motion](style, draw, times, place(*config.period))
