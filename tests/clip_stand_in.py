@@ -48,7 +48,17 @@ def made_up(planned: PlannedClip) -> ObservedClip:
     u, v = synthetic.camera.project(synthetic.joints).round().long().unbind(-1)
     silhouettes = torch.zeros(len(pose), 48, 64, dtype=torch.bool)
     silhouettes[torch.arange(len(pose))[:, None], v.clamp(0, 47), u.clamp(0, 63)] = True
-    clip = Clip(planned.activity, str(planned.subject), str(planned.take), pose, directions, silhouettes)
+    clip = Clip(
+        planned.activity,
+        str(planned.subject),
+        str(planned.take),
+        pose,
+        directions,
+        silhouettes,
+        BODY(pose, synthetic.size).joints,
+        BODY.joint_names,
+        torch.full_like(pose, 0.05),
+    )
     return ObservedClip(clip, torch.full((len(pose), 8), 0.1))
 
 

@@ -42,6 +42,7 @@ QUICK_POSE = PoseConfig(
     size=SizeConfig(rounds=0),
     size_frames=1,
 )
+STREAMS = ("pose", "directions", "silhouettes", "joints", "pose_sd")
 SEEN = PlannedClip("left_hand", 4, 1, "train", 3, 1.0)
 
 
@@ -100,7 +101,7 @@ def test_what_is_in_the_cache_is_not_made_again(tmp_path: Path, stand_in: Maker)
     assert len(stand_in.made) == 8
     for one, other in zip(first.observed, again.observed, strict=True):
         assert str(one.clip) == str(other.clip)
-        for name in ("pose", "directions", "silhouettes"):
+        for name in STREAMS:
             torch.testing.assert_close(
                 one.clip.stream(name), other.clip.stream(name), atol=0, rtol=0, equal_nan=True
             )
@@ -195,7 +196,7 @@ def test_no_damage_gets_through(tmp_path: Path, stand_in: Maker):
         path.write_bytes(content[:start] + b"\xff" * 25 + content[start + 25 :])
         found = maker.find(planned)
         if found is not None:  # some bytes of an archive, such as times, say nothing
-            for name in ("pose", "directions", "silhouettes"):
+            for name in STREAMS:
                 expected = whole.clip.stream(name)
                 torch.testing.assert_close(found.clip.stream(name), expected, atol=0, rtol=0, equal_nan=True)
 

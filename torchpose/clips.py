@@ -5,12 +5,14 @@ What a clip holds is estimated from the images; the truth serves only to say how
 
 import functools
 import hashlib
+import io
 import json
 import multiprocessing
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -27,6 +29,7 @@ from torchpose.activity.dataset import Clip, Fold
 from torchpose.activity.subspace import Crop, SilhouetteConfig, resize_silhouettes
 from torchpose.atomic import replacing
 from torchpose.body.angle import limb_angles
+from torchpose.body.model import BodyModel
 from torchpose.eyes import EyesConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.rendered import RenderedRecording
@@ -36,7 +39,9 @@ from torchpose.version import __version__
 
 # What comes after the clips, and does not change them.
 _AFTER_CLIPS = ("activity/", "configs/", "cli.py", "export.py", "figures.py", "session.py", "study.py")
-_ARRAYS = ("pose", "directions", "silhouettes", "angle_error")  # of a clip's file
+_STREAMS = ("pose", "directions", "silhouettes", "joints", "pose_sd")
+_ARRAYS = (*_STREAMS, "angle_error")  # of a clip's file
+_TELL = 20.0  # s between lines that say how far it is, where no bar can be drawn
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,12 @@ def _code_version() -> str:
     return f"{__version__}+{digest.hexdigest()[:16]}"
 
 
+@functools.cache
+def _actors_body() -> BodyModel:
+    """The body of those who perform; to build it takes as long as to render five frames."""
+    return BodyModel()
+
+
 @dataclass(frozen=True)
 class ClipMaker:
     """Everything that a clip depends on; goes whole to another process."""
@@ -111,7 +122,7 @@ class ClipMaker:
     @torch.no_grad()
     def make(self, planned: PlannedClip) -> ObservedClip:
         """Render a performance and observe it as any other recording."""
-        synthetic = planned.record(self.data.database)
+        synthetic = planned.record(self.data.database, _actors_body())
         recording = RenderedRecording(synthetic)
         model = StereoToPose(recording.camera, self.eyes, self.pose).to(self.device)
         model.prepare(recording)
@@ -137,6 +148,9 @@ class ClipMaker:
             pose=pose,
             directions=directions,
             silhouettes=torch.cat(silhouettes).cpu(),
+            joints=sequence.joints.cpu(),
+            joint_names=model.body.joint_names,
+            pose_sd=sequence.pose_covariance.diagonal(dim1=1, dim2=2).sqrt().cpu(),
         )
         error = (sequence.limb_angles.cpu() - limb_angles(synthetic.joints)).abs()
         return ObservedClip(clip, error)
@@ -144,7 +158,7 @@ class ClipMaker:
     def store(self, planned: PlannedClip) -> None:
         """Make a clip and put it into the cache, whole or not at all."""
         observed = self.make(planned)
-        streams = [observed.clip.stream(name) for name in _ARRAYS[:-1]]
+        streams = [observed.clip.stream(name) for name in _STREAMS]
         arrays = [stream.numpy() for stream in (*streams, observed.angle_error)]
         with replacing(self.path(planned)) as partial:
             np.savez_compressed(partial, allow_pickle=False, **dict(zip(_ARRAYS, arrays, strict=True)))
@@ -154,14 +168,15 @@ class ClipMaker:
         path = self.path(planned)
         if not path.exists():
             return None
+        content = io.BytesIO(path.read_bytes())
         try:
-            with path.open("rb") as file, np.load(file) as archive:
-                pose, directions, silhouettes, error = (torch.from_numpy(archive[name]) for name in _ARRAYS)
-        except OSError:
-            raise
+            with np.load(content) as archive:
+                streams = {name: torch.from_numpy(archive[name]) for name in _STREAMS}
+                error = torch.from_numpy(archive["angle_error"])
         except Exception:  # zipfile, zlib and NumPy's own parser each complain of damage in their own words
             return None
-        clip = Clip(planned.activity, str(planned.subject), str(planned.take), pose, directions, silhouettes)
+        names = _actors_body().joint_names
+        clip = Clip(planned.activity, str(planned.subject), str(planned.take), joint_names=names, **streams)
         return ObservedClip(clip, error)
 
 
@@ -180,10 +195,19 @@ def build_database(maker: ClipMaker, workers: int = 2, fresh: bool = False) -> D
         disable=not sys.stderr.isatty(),
         leave=False,
     ) as bar:
-        for planned in _stored(maker, missing, workers):
+        begin = told = time.monotonic()
+        for number, planned in enumerate(_stored(maker, missing, workers), 1):
             found[planned] = maker.find(planned)
             bar.set_postfix_str(planned.activity)
             bar.update()
+            if bar.disable and time.monotonic() - told > _TELL:
+                told = time.monotonic()
+                done = len(plan) - len(missing) + number
+                print(
+                    f"recordings: {done} of {len(plan)} after {told - begin:.0f} s",
+                    file=sys.stderr,
+                    flush=True,
+                )
     observed = [found[planned] for planned in plan]
     assert all(clip is not None for clip in observed)
     train, test = (

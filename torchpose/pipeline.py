@@ -48,7 +48,6 @@ from torchpose.vision.points import CellConfig, group_cells
 
 RIM = 0.03  # m by which a cloud falls short of a person: half a step of its grid at the head and at the feet
 WHOLE_SIGHTS = 2  # of all of somebody, that tell the size
-LEAST_UPRIGHT = 0.83  # of the body file's height; whoever looks shorter sits or stoops
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,7 @@ class PoseConfig:
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them
     height: float = 0.0  # m, of the person; 0 measures it
+    least_height: float = 1.53  # m; whoever looks shorter sits or stoops
     size: SizeConfig = field(default_factory=SizeConfig)
     size_frames: int = 4  # of the recording, from which height and proportions are measured
     cells: CellConfig = field(default_factory=CellConfig)  # of the geodesic term
@@ -227,7 +227,7 @@ class StereoToPose(nn.Module):
         Whoever stoops looks shorter, never taller, so of three or more the second tallest counts (the tallest may
         hold a stray point). Without any that may be somebody upright it is the body file's height.
         """
-        heights = sorted(one + RIM for one in extents if one + RIM > LEAST_UPRIGHT * self.body.height)
+        heights = sorted(one + RIM for one in extents if one + RIM > self.config.least_height)
         if not heights:
             return self.body.height
         return min(heights[-2] if len(heights) > 2 else heights[-1], 1.2 * self.body.height)

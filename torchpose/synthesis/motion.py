@@ -34,6 +34,7 @@ ACTIVITIES = (
 EXERCISES = ("arms", "elbow_horizontal", "elbow_vertical", "knee", "shoulder", "turning")
 MOTIONS = (*ACTIVITIES, *EXERCISES, "free", "demo")
 LEFT, RIGHT = 0, 1
+_USUAL = 4.0  # s, of a take: a person's place is its average over these
 AHEAD = math.pi / 2  # azimuth of a limb that is raised straight ahead; 0: outward to its own side
 
 
@@ -398,7 +399,8 @@ def perform(
     """
     if motion not in _ACTS:
         raise ValueError(f"the motion must be one of {', '.join(MOTIONS)}, got {motion!r}")
-    times = times.to(size)
+    asked, usual = len(times), torch.arange(0.0, _USUAL, 0.1)
+    times = torch.cat([times.to(size), usual.to(size)])  # the place must not depend on what is asked for
     style, draw = Draw("style", motion, person), Draw("take", motion, person, take)
     place = Draw("place", person, take, motion)
     figure = _ACTS[motion](style, draw, times, place(*config.period))
@@ -407,7 +409,8 @@ def perform(
     pose = pose_figure(body, figure, times.new_tensor(heading).expand_as(times))
     near, far = _distances(body, size, camera, config)
     spot = torch.tensor([config.aside * place(-1.0, 1.0), place(near, far)]).to(size)
-    return torch.cat((_stand(body, size, pose, figure, heading, spot, config.floor), pose[:, 3:]), -1)
+    root = _stand(body, size, pose, figure, heading, spot, config.floor, len(usual))
+    return torch.cat((root, pose[:, 3:]), -1)[:asked]
 
 
 def pose_figure(
@@ -440,9 +443,10 @@ def _stand(
     heading: float,
     spot: Float[Tensor, "2"],
     floor: float,
+    settled: int,
 ) -> Float[Tensor, "time 3"]:
-    """Where the root must be for the lower foot to stand on the floor and to keep its place there, x and z at
-    `spot`.
+    """Where the root must be for the lower foot to stand on the floor and to keep its place there; on the average of
+    the last `settled` frames x and z are those of `spot`.
     """
     posed = body(pose, size)
     soles = lowest(body, posed)  # (T, 2)
@@ -455,7 +459,9 @@ def _stand(
     )
     hips = _joints(body, upright, "hip")[..., 0::2]  # above where each foot stands at ease
     feet = _joints(body, posed, "ankle")[..., 0::2]
-    across = spot + (bears[..., None] * (hips - feet)).sum(1)
+    across = (bears[..., None] * (hips - feet)).sum(1)
+    # Whoever sits down moves back: on the average a person is at the spot, or the place would tell the activity.
+    across = spot + across - across[-settled:].mean(0)
     return torch.stack((across[:, 0], height, across[:, 1]), -1)
 
 
