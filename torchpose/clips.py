@@ -141,6 +141,8 @@ class ClipMaker:
         directions = pose.new_full((len(pose), len(model.body.body_names) - 1, 3), torch.nan)
         posed = model.body(sequence.pose[found.to(sequence.pose.device)], model.size)
         directions[found] = model.body.limb_directions(posed).cpu()
+        covariance = sequence.pose_covariance
+        assert covariance is not None
         clip = Clip(
             planned.activity,
             str(planned.subject),
@@ -150,7 +152,7 @@ class ClipMaker:
             silhouettes=torch.cat(silhouettes).cpu(),
             joints=sequence.joints.cpu(),
             joint_names=model.body.joint_names,
-            pose_sd=sequence.pose_covariance.diagonal(dim1=1, dim2=2).sqrt().cpu(),
+            pose_sd=covariance.diagonal(dim1=1, dim2=2).sqrt().cpu(),
         )
         error = (sequence.limb_angles.cpu() - limb_angles(synthetic.joints)).abs()
         return ObservedClip(clip, error)
