@@ -136,6 +136,7 @@ class ClipMaker:
             frames.append(replace(frame, sight=None))  # its images are large
         sequence = model.sequence(frames)
         assert sequence.pose is not None
+        assert sequence.pose_covariance is not None
         pose = sequence.pose.cpu()
         found = ~pose.isnan().any(1)
         directions = pose.new_full((len(pose), len(model.body.body_names) - 1, 3), torch.nan)
