@@ -1,6 +1,7 @@
 """The thesis's three tables of recognised activities (T. 5.3), beside ours: joint angles, PCA, ICA.
 
-python -m benchmarks.activity [--cache DIR] [--seeds N] [--make] [--any-version] [--partial] [--json FILE] [KEY=VALUE]
+python -m benchmarks.activity [--cache DIR] [--seeds N] [--only FEATURE] [--make] [--any-version] [--partial]
+    [--json FILE] [KEY=VALUE ...]
 
 The clips are those of `python train.py experiment=thesis`, from its cache; `--make` makes what is missing there, in
 minutes to an hour. Features come from what the pipeline estimates from rendered stereo pairs, and no test person
@@ -125,6 +126,11 @@ def options_of(kind: FeatureKind, config: RecognizerConfig) -> dict[str, Recogni
 def groups_of_people(clips: Sequence[Clip], train: Sequence[int]) -> list[Fold]:
     """The training clips in folds: each tests a part of the people on what the others taught."""
     people = sorted({clips[i].subject for i in train})
+    if len(people) < 2:
+        raise ValueError(
+            f"to choose needs at least two training people, got {len(people)}; give data.database.train_subjects=2 or "
+            "--only-thesis"
+        )
     folds = []
     for number in range(min(GROUPS, len(people))):
         out = set(people[number::GROUPS])
@@ -161,7 +167,7 @@ def make_tables(
 ) -> list[Table]:
     """The tables of each feature: the thesis's protocol, then, with `choose`, what is best on the training people."""
     tables = []
-    inner = groups_of_people(clips, fold.train)
+    inner = groups_of_people(clips, fold.train) if choose else []
     for kind in kinds:
         options = options_of(kind, config)
         plain = next(iter(options))
@@ -250,7 +256,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--cache", type=Path, help="folder with the clips; else that of the settings")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--features", nargs="+", choices=[kind.value for kind in THESIS])
+    parser.add_argument("--only", choices=[kind.value for kind in THESIS], help="one of the features")
     parser.add_argument("--only-thesis", action="store_true", help="its protocol alone: nothing is chosen")
     parser.add_argument("--make", action="store_true", help="make the clips that are missing")
     parser.add_argument("--any-version", action="store_true", help="take clips that other code made")
@@ -283,7 +289,7 @@ def main(arguments: list[str] | None = None) -> None:
         f"{lost} without a pose; limb angles {error:.1f} degrees off; {options.seeds} starts on this one database\n"
     )
     names = config.data.database.activities
-    kinds = [FeatureKind(name) for name in options.features] if options.features else list(THESIS)
+    kinds = [FeatureKind(options.only)] if options.only else list(THESIS)
     tables = make_tables(
         clips, Fold(train, test), kinds, config.recognizer, names, options.seeds, not options.only_thesis
     )
