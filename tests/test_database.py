@@ -9,8 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.stats import f_oneway
+from sklearn.ensemble import RandomForestClassifier
 
 from torchpose.body.model import BodyModel
+from torchpose.body.superquadric import draw_person
 from torchpose.recording import Backgrounds, Frame, open_recording, write_recording
 from torchpose.synthesis.database import (
     DatabaseConfig,
@@ -20,6 +23,7 @@ from torchpose.synthesis.database import (
     plan_database,
     synthetic_camera,
 )
+from torchpose.synthesis.motion import perform
 
 BODY = BodyModel()
 CAMERA = synthetic_camera(80, 60, 10.0)
@@ -124,19 +128,42 @@ def test_the_plan_has_the_sequences_asked_for_and_test_people_never_train():
         assert (count.count("train"), count.count("test")) == (15, 40)
 
 
-def test_length_and_noise_do_not_tell_the_activity():
-    plan = plan_database(DatabaseConfig(train_sequences=40, test_sequences=100))
+@functools.cache
+def nuisances() -> tuple[np.ndarray, np.ndarray]:
+    """Length, noise, place (x, z of the hips on the average, m) and heading of 40 sequences of each activity."""
+    config = DatabaseConfig(train_sequences=15, test_sequences=25)
+    camera = synthetic_camera(config.width, config.height, config.frame_rate)
+    size = functools.cache(lambda subject: draw_person(subject).size(BODY))
+    rows, activities = [], []
+    for clip in plan_database(config):
+        times = torch.arange(clip.frames) / config.frame_rate
+        with torch.no_grad():
+            pose = perform(BODY, size(clip.subject), clip.activity, times, camera, clip.subject, clip.take)
+        x, _, z, heading = pose[:, :4].mean(0).tolist()
+        rows.append((clip.frames, clip.noise, x, z, heading))
+        activities.append(clip.activity)
+    return np.array(rows), np.array(activities)
+
+
+def test_lengths_noise_places_and_headings_are_of_one_distribution():
+    rows, activities = nuisances()
     low, high = DatabaseConfig().frames
-    assert {clip.frames for clip in plan} == set(range(low, high + 1))
-    for value in (lambda clip: clip.frames / high, lambda clip: clip.noise):
-        means = torch.tensor(
-            [
-                [float(value(clip)) for clip in plan if clip.activity == activity]
-                for activity in DatabaseConfig().activities
-            ]
-        )
-        error = means.std(1).mean() / means.shape[1] ** 0.5
-        assert (means.mean(1) - means.mean()).abs().max() < 3.5 * error
+    assert set(rows[:, 0]) == set(range(low, high + 1))
+    for value in rows.T:
+        groups = [value[activities == activity] for activity in DatabaseConfig().activities]
+        assert f_oneway(*groups).pvalue > 1e-3
+
+
+def test_length_noise_place_and_heading_do_not_teach_the_activity():
+    rows, activities = nuisances()
+    half = np.arange(len(rows)) % 2 == 0
+    right = []
+    for train, test in ((half, ~half), (~half, half)):
+        forest = RandomForestClassifier(100, min_samples_leaf=3, random_state=0)
+        right.append(forest.fit(rows[train], activities[train]).score(rows[test], activities[test]))
+    chance = 1 / len(set(activities))
+    error = (chance * (1 - chance) / len(rows)) ** 0.5
+    assert abs(np.mean(right) - chance) < 3 * error
 
 
 def test_keys_change_with_what_the_clip_depends_on_and_with_nothing_else():

@@ -136,6 +136,7 @@ class ClipMaker:
             frames.append(replace(frame, sight=None))  # its images are large
         sequence = model.sequence(frames)
         assert sequence.pose is not None
+        assert sequence.pose_covariance is not None
         pose = sequence.pose.cpu()
         found = ~pose.isnan().any(1)
         directions = pose.new_full((len(pose), len(model.body.body_names) - 1, 3), torch.nan)
@@ -168,18 +169,21 @@ class ClipMaker:
     def find(self, planned: PlannedClip) -> ObservedClip | None:
         """The clip in the cache; None where it is not there or its file is damaged."""
         path = self.path(planned)
-        if not path.exists():
-            return None
-        content = io.BytesIO(path.read_bytes())
-        try:
-            with np.load(content) as archive:
-                streams = {name: torch.from_numpy(archive[name]) for name in _STREAMS}
-                error = torch.from_numpy(archive["angle_error"])
-        except Exception:  # zipfile, zlib and NumPy's own parser each complain of damage in their own words
-            return None
-        names = _actors_body().joint_names
-        clip = Clip(planned.activity, str(planned.subject), str(planned.take), joint_names=names, **streams)
-        return ObservedClip(clip, error)
+        return read_clip(planned, path) if path.exists() else None
+
+
+def read_clip(planned: PlannedClip, path: Path) -> ObservedClip | None:
+    """What a file of the cache holds of a performance, whatever made it; None where the file is damaged."""
+    content = io.BytesIO(path.read_bytes())
+    try:
+        with np.load(content) as archive:
+            streams = {name: torch.from_numpy(archive[name]) for name in _STREAMS}
+            error = torch.from_numpy(archive["angle_error"])
+    except Exception:  # zipfile, zlib and NumPy's own parser each complain of damage in their own words
+        return None
+    names = _actors_body().joint_names
+    clip = Clip(planned.activity, str(planned.subject), str(planned.take), joint_names=names, **streams)
+    return ObservedClip(clip, error)
 
 
 def build_database(maker: ClipMaker, workers: int = 2, fresh: bool = False) -> Database:
