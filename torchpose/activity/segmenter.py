@@ -1,4 +1,4 @@
-"""Segments of a long sequence, by Viterbi over chained models whose durations are explicit (a hidden semi-Markov model).
+"""Segments of a long sequence: Viterbi over chained models with explicit durations, a hidden semi-Markov model.
 
 A segment has a label; inside it that label's own HMM runs, and from a duration of d frames it is left with the label's
 hazard p(d | at least d). `Segmenter` takes frames as they come, and gives its answers when the recording is over (the
