@@ -11,14 +11,12 @@ from torchpose.activity.diary import Entry
 from torchpose.journal import (
     Journal,
     Period,
-    Stretch,
     main,
     read_activities_csv,
     totals_table,
-    within_hours,
     write_activities_csv,
 )
-from torchpose.timeline import plot_timeline
+from torchpose.timeline import Stretch, plot_timeline, within_hours
 
 MORNING = datetime(2026, 11, 23, 8, 30)
 
@@ -166,7 +164,7 @@ def test_a_table_that_is_none_is_told_in_a_sentence(tmp_path):
     with pytest.raises(ValueError, match="must have the columns start_s, end_s, activity, log_odds"):
         read_activities_csv(path)
     path.write_text("start_s,end_s,activity,log_odds\n3,2,sitting,\n")
-    with pytest.raises(ValueError, match="an entry must end after its start, got 3.0 to 2.0 s"):
+    with pytest.raises(ValueError, match=r"an entry must end after its start, got 3\.0 to 2\.0 s"):
         read_activities_csv(path)
 
 

@@ -67,7 +67,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "learning": ("part_network", "training"),
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
-        *("export", "figures", "journal", "timeline", "activities"),
+        *("export", "figures", "timeline", "journal", "activities"),
         *("eyes", "pipeline", "people", "session", "clips", "study", "cli"),
     ),
 }

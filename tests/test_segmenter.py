@@ -174,7 +174,7 @@ def test_a_segment_tells_the_likelihood_of_its_frames_under_every_label():
 def test_frames_without_an_observation_cost_nothing():
     chain, emission = random_chain(4), random_emission(4, 7)
     emission[2:5] = 0
-    best, labels = max(every_segmentation(chain, emission))
+    _, labels = max(every_segmentation(chain, emission))
     assert by_frame(segment_frames(chain, emission)) == list(labels)
 
 

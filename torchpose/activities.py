@@ -34,7 +34,7 @@ class ActivityWriter:
     def __init__(
         self,
         recognizer: Path | str,
-        config: DiaryConfig = DiaryConfig(),
+        config: DiaryConfig = DiaryConfig(),  # noqa: B008 (frozen)
         journal: Path | str | None = None,
         person: str = "person",
         started: datetime | None = None,

@@ -18,13 +18,13 @@ import sqlite3
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from datetime import date, datetime, time, timedelta
 from enum import Enum
 from pathlib import Path
 
 from torchpose.activity.diary import Entry
 from torchpose.atomic import replacing
+from torchpose.timeline import Stretch, plot_timeline, within_hours
 
 VERSION = 1  # of the tables below
 _APPLICATION = 0x746F7270  # "torp": what SQLite's header says the file is of
@@ -48,17 +48,6 @@ class Period(Enum):
 
     hour = "hour"
     day = "day"
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Somebody did something from a moment to another."""
-
-    person: str
-    start: datetime
-    end: datetime
-    activity: str
-    log_odds: float = math.nan
 
 
 def write_activities_csv(path: Path, entries: Iterable[Entry]) -> None:
@@ -243,24 +232,6 @@ class Journal:
             ) from error
 
 
-def within_hours(
-    stretches: Iterable[Stretch], after: time | None = None, before: time | None = None
-) -> Iterator[Stretch]:
-    """The parts of the stretches that lie in each day's hours from `after` to `before` (none: midnight)."""
-    after = after or time.min
-    if before is not None and before <= after:
-        raise ValueError(f"the hours must end after they begin, got {after} to {before}; ask for two parts")
-    for stretch in stretches:
-        day = stretch.start.date()
-        while datetime.combine(day, time.min) < stretch.end:
-            midnight = datetime.combine(day + timedelta(days=1), time.min)
-            start = max(stretch.start, datetime.combine(day, after))
-            end = min(stretch.end, midnight if before is None else datetime.combine(day, before))
-            if start < end:
-                yield Stretch(stretch.person, start, end, stretch.activity, stretch.log_odds)
-            day += timedelta(days=1)
-
-
 def _periods(stretch: Stretch, by: Period) -> Iterator[tuple[datetime, timedelta]]:
     """How much of a stretch lies in each day or hour."""
     start = stretch.start
@@ -329,8 +300,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
         journal = Journal(args.file)
         if args.timeline is not None:
-            from torchpose.timeline import plot_timeline
-
             found = journal.stretches(args.person, start, end, args.activity)
             plot_timeline(args.timeline, list(within_hours(found, args.after, args.before)))
             print(args.timeline)

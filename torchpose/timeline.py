@@ -1,13 +1,14 @@
-"""A picture of the journal: what was done when, a row for each day of each person."""
+"""Who did what when, and a picture of it, a row for each day of each person. Times are local and have no zone."""
 
-from collections.abc import Sequence
-from datetime import datetime, time
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, time, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpose.activity.diary import OTHER, PAUSE, UNSEEN
 from torchpose.atomic import replacing
-from torchpose.journal import Stretch, within_hours
 
 if TYPE_CHECKING:
     from matplotlib.ticker import MultipleLocator
@@ -20,6 +21,35 @@ _COLOURS = (
 _GREYS = {PAUSE: "0.80", OTHER: "0.55"}
 _UNSEEN: dict[str, Any] = {"facecolor": "0.97", "edgecolor": "0.75", "hatch": "////", "linewidth": 0}
 _HOUR = 3600.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Somebody did something from a moment to another."""
+
+    person: str
+    start: datetime
+    end: datetime
+    activity: str
+    log_odds: float = math.nan
+
+
+def within_hours(
+    stretches: Iterable[Stretch], after: time | None = None, before: time | None = None
+) -> Iterator[Stretch]:
+    """The parts of the stretches that lie in each day's hours from `after` to `before` (none: midnight)."""
+    after = after or time.min
+    if before is not None and before <= after:
+        raise ValueError(f"the hours must end after they begin, got {after} to {before}; ask for two parts")
+    for stretch in stretches:
+        day = stretch.start.date()
+        while datetime.combine(day, time.min) < stretch.end:
+            midnight = datetime.combine(day + timedelta(days=1), time.min)
+            start = max(stretch.start, datetime.combine(day, after))
+            end = min(stretch.end, midnight if before is None else datetime.combine(day, before))
+            if start < end:
+                yield Stretch(stretch.person, start, end, stretch.activity, stretch.log_odds)
+            day += timedelta(days=1)
 
 
 def plot_timeline(path: Path, stretches: Sequence[Stretch]) -> None:
