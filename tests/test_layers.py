@@ -58,7 +58,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "partition", "tracker"),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
-        *("inference", "baum_welch", "hmm", "codebook", "score_layer", "recognizer", "diary"),
+        *("inference", "baum_welch", "hmm", "codebook", "score_layer", "recognizer", "segmenter", "diary"),
     ),
     "synthesis": (
         *("motion", "path", "box", "room", "actor", "render", "depth"),
@@ -67,7 +67,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "learning": ("part_network", "training"),
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
-        *("export", "figures"),
+        *("export", "figures", "timeline", "journal", "activities"),
         *("eyes", "pipeline", "window", "people", "session", "clips", "study", "cli"),
     ),
 }

@@ -8,12 +8,15 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import torch
 
+from torchpose.activities import ActivityWriter, activity_lines
 from torchpose.activity.dataset import Clip, Fold, Split, read_skeletons, split_clips
+from torchpose.activity.diary import DiaryConfig
 from torchpose.activity.features import FeatureKind
 from torchpose.activity.recognizer import RecognizerConfig
 from torchpose.aligned import AlignedRecording, align_recording
@@ -67,6 +70,15 @@ class InferConfig:
     eyes: EyesConfig = field(default_factory=EyesConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     people: PeopleConfig = field(default_factory=PeopleConfig)
+    recognizer: str | None = (
+        None  # folder of a trained one, runs/train/recognizers/angles: writes activities.csv
+    )
+    journal: str | None = (
+        None  # SQLite file to which the activities are added, see python -m torchpose.journal --help
+    )
+    started: str | None = None  # local date and time of the first frame, 2026-11-23T08:30, for the journal
+    person: str = "person"  # whose name the journal has
+    diary: DiaryConfig = field(default_factory=DiaryConfig)
 
     def __post_init__(self) -> None:
         given = [name for name in ("right", "calibration", "background") if getattr(self, name) is not None]
@@ -86,7 +98,30 @@ class InferConfig:
             raise ValueError(
                 f"max_width must be at least 64 px, got {self.max_width}; 640 to 1280 make sense"
             )
+        self._check_journal()
         _check_machine(self.seed, self.threads)
+
+    def _check_journal(self) -> None:
+        if self.journal is None:
+            return
+        for name in ("recognizer", "started"):
+            if getattr(self, name) is None:
+                raise ValueError(f"{name} must be given for a journal, got null; add {name}=")
+        self.beginning()
+
+    def beginning(self) -> datetime | None:
+        """When the recording started; ValueError where `started` is no local date and time."""
+        if self.started is None:
+            return None
+        try:
+            begin = datetime.fromisoformat(self.started)
+        except ValueError:
+            begin = None
+        if begin is None or begin.tzinfo is not None:
+            raise ValueError(
+                f"started must be a local date and time such as 2026-11-23T08:30, got {self.started!r}"
+            )
+        return begin
 
 
 @dataclass(frozen=True)
@@ -171,6 +206,7 @@ def train_main(argv: Sequence[str]) -> int:
 def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
     output, settings = Path(config.output), settings_of(config)
+    activities = _activities(config)
     if config.recording is None:
         print("no recording given: making one (recording=DIR runs yours)")
         recording: Recording = demo_recording(config.seed)
@@ -188,6 +224,15 @@ def infer(config: InferConfig, device: torch.device) -> None:
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
     session = Session(People(model, config.people), recording, output, settings, __version__, rows_before)
     print(summary_table(session.run(config.fresh, config.max_frames), output))
+    if activities is not None:
+        print(activity_lines(activities.write(output, model.body, str(output.resolve()))))
+
+
+def _activities(config: InferConfig) -> ActivityWriter | None:
+    """What tells the activities, where the configuration names a recogniser."""
+    if config.recognizer is None:
+        return None
+    return ActivityWriter(config.recognizer, config.diary, config.journal, config.person, config.beginning())
 
 
 def _captured(config: InferConfig, output: Path) -> InferConfig:

@@ -38,7 +38,10 @@ from torchpose.synthesis.database import DatabaseConfig, PlannedClip, plan_datab
 from torchpose.version import __version__
 
 # What comes after the clips, and does not change them.
-_AFTER_CLIPS = ("activity/", "configs/", "cli.py", "export.py", "figures.py", "session.py", "study.py")
+_AFTER_CLIPS = (
+    *("activities.py", "activity/", "configs/", "cli.py", "export.py", "figures.py", "journal.py"),
+    *("session.py", "study.py", "timeline.py"),
+)
 _STREAMS = ("pose", "directions", "silhouettes", "joints", "pose_sd")
 _ARRAYS = (*_STREAMS, "angle_error")  # of a clip's file
 _TELL = 20.0  # s between lines that say how far it is, where no bar can be drawn
