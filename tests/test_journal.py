@@ -107,6 +107,9 @@ def test_what_cannot_be_added_leaves_the_journal_as_it_was(journal):
     ):
         journal.add("anna", "four", datetime(2026, 11, 23, 12, 10), minutes((30, "sitting")))
 
+    with pytest.raises(ValueError, match="in two places at once, got two at"):  # what "two" was comes back
+        journal.add("anna", "two", MORNING, minutes((30, "walking")))
+
     def broken():
         yield from minutes((1, "sitting"))
         raise KeyboardInterrupt
@@ -115,7 +118,7 @@ def test_what_cannot_be_added_leaves_the_journal_as_it_was(journal):
         journal.add("anna", "two", MORNING, broken())
     with pytest.raises(ValueError, match="local and have no zone"):
         journal.add("anna", "five", datetime.fromisoformat("2026-11-25T08:00+01:00"), minutes((1, "sitting")))
-    assert [s.start for s in journal.stretches()] == [s.start for s in before]
+    assert [(s.start, s.activity) for s in journal.stretches()] == [(s.start, s.activity) for s in before]
 
 
 def test_another_file_is_told_in_a_sentence(tmp_path, journal):

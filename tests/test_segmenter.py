@@ -91,6 +91,19 @@ def test_the_best_of_all_segmentations_is_found(seed, ages, forbidden):
     assert [segment.end for segment in segments[:-1]] == [segment.start for segment in segments[1:]]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_with_three_states_the_bands_go_the_right_way(seed):
+    chain, emission = random_chain(seed, labels=2, states=3), random_emission(seed, 6, 2, 3)
+    closed = chain.log_transition.clone()  # 0 -> 1 -> 2 -> 0
+    closed[:, [0, 1, 2], [2, 0, 1]] = -torch.inf
+    closed = torch.log_softmax(closed, -1)
+    chain = Chain(chain.log_start, chain.log_change, chain.log_leave, chain.log_initial, closed)
+    best, labels = max(every_segmentation(chain, emission))
+    segmenter = Segmenter(chain)
+    assert by_frame(segmenter.push(emission) + segmenter.finish()) == list(labels)
+    assert_close(float(segmenter.log_probability), best, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("lag", [0, 1, 3])
 def test_a_settled_label_is_the_best_of_what_agrees_with_those_before(seed, lag):

@@ -226,8 +226,11 @@ class Eyes(nn.Module):
         if left is not None and right is not None:
             left, right = left.to(device), right.to(device)
             some = self._pairs(recording, spread_positions(len(recording), GLANCES), device)
+            both = min(len(left), len(right))
             with self.stopwatch.measure("background"):
-                if stands_in_background((left, right), some, self.stereo, self.camera, span, rules):
+                if stands_in_background(
+                    (left[:both], right[:both]), some, self.stereo, self.camera, span, rules
+                ):
                     left = right = None
         if left is not None and right is not None:
             with self.stopwatch.measure("background"):

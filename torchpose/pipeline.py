@@ -3,6 +3,7 @@
 Left-camera frame, metres and radians.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -383,9 +384,11 @@ class SmoothingWindow:
 
 
 def upright_extent(sight: Sight) -> float:
-    """From the head's top down to the lowest point, m."""
+    """From the head's top down to the lowest point, m; NaN where no point lies below the head."""
     points = sight.cloud.points[0][sight.cloud.mask[0]]
     middle = points.median(0).values
     center = sight.faces.position[0, 0] if bool(sight.faces.found[0]) else middle[0]
     column = points[(points[:, 0] - center).abs() < 0.12, 1]  # raised hands are beside the head
+    if not len(column):
+        return math.nan
     return float(torch.quantile(points[:, 1], 0.99) - torch.quantile(column, 0.01))

@@ -132,7 +132,7 @@ def _small_disparity(
     matcher: StereoMatcher,
     disparity_range: tuple[int, int],
     config: EmptySceneConfig,
-) -> Planes:
+) -> Float[Tensor, "frames h w"]:
     """Disparities of shrunken pairs, px of these."""
     size = (left.shape[2] // config.shrink, left.shape[3] // config.shrink)
     least, greatest = disparity_range[0] // config.shrink, -(-disparity_range[1] // config.shrink)
