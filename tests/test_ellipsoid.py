@@ -631,3 +631,13 @@ def test_a_flattened_body_is_the_body_pressed_along_each_parts_ray(share):
         plain = foot_of_part(posed, part, points[None], False)
         assert_close(whole.local, plain.local, atol=1e-6, rtol=0)
         assert_close(whole.normal, plain.normal, atol=1e-6, rtol=0)
+
+
+def test_a_broken_row_does_not_keep_others_from_being_flattened():
+    body = BodyModel()
+    pose = torch.cat([torch.tensor([[0.3, 0.1, 3.5, 0.4, 0.1, 0.0]]), body.rest[None]], 1)
+    share = torch.full((2, body.num_parts), 0.5)
+    broken, _ = flattened(body(torch.cat([pose, pose * torch.nan])), share)
+    alone, _ = flattened(body(pose), share[:1])
+    assert_close(broken.radii[:1], alone.radii)
+    assert broken.radii[1].isnan().all()

@@ -317,7 +317,11 @@ def flattened(
         less = share[..., None, None]
         unit = posed.frames / posed.radii[..., None, :]
         unit = unit + (1 / less - 1) * ray * (ray.mT @ unit)
-        square, axes = torch.linalg.eigh(unit @ unit.mT)  # of the form that is 1 on the pressed surface
+        form = unit @ unit.mT  # 1 on the pressed surface
+        # eigh raises for the whole batch where one row is not finite.
+        sound = form.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+        square, axes = torch.linalg.eigh(torch.where(sound, form, torch.eye(3).to(form)))
+        square = torch.where(sound[..., 0], square, torch.nan)
         frames = axes - (1 - less) * ray * (ray.mT @ axes)
         back = posed.frames.mT @ (axes + (1 / less - 1) * ray * (ray.mT @ axes))
     return replace(posed, frames=frames, radii=square.rsqrt()), back
