@@ -48,6 +48,7 @@ from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import CellConfig, group_cells
 
 RIM = 0.03  # m by which a cloud falls short of a person: half a step of its grid at the head and at the feet
+SITTING = 0.76  # of the body file's height: whoever looks shorter sits or stoops
 WHOLE_SIGHTS = 2  # of all of somebody, that tell the size
 
 
@@ -68,7 +69,7 @@ class PoseConfig:
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     person: str = ""  # person.yaml of an earlier run, whose sizes are taken; empty measures them
     height: float = 0.0  # m, of the person; 0 measures it
-    least_height: float = 1.53  # m; whoever looks shorter sits or stoops
+    least_height: float = 1.66  # m; who looks shorter may have feet that are not seen
     size: SizeConfig = field(default_factory=SizeConfig)
     size_frames: int = 4  # of the recording, from which height and proportions are measured
     cells: CellConfig = field(default_factory=CellConfig)  # of the geodesic term
@@ -228,10 +229,11 @@ class StereoToPose(nn.Module):
         Whoever stoops looks shorter, never taller, so of three or more the second tallest counts (the tallest may
         hold a stray point). Without any that may be somebody upright it is the body file's height.
         """
-        heights = sorted(one + RIM for one in extents if one + RIM > self.config.least_height)
+        heights = sorted(one + RIM for one in extents if one + RIM > SITTING * self.body.height)
         if not heights:
             return self.body.height
-        return min(heights[-2] if len(heights) > 2 else heights[-1], 1.2 * self.body.height)
+        measured = heights[-2] if len(heights) > 2 else heights[-1]
+        return min(max(measured, self.config.least_height), 1.2 * self.body.height)
 
     def forward(self, recording: Recording) -> Iterator[FramePose]:
         """Poses of a prepared recording's frames, in order and smoothed."""

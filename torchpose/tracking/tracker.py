@@ -231,9 +231,10 @@ class Tracker(nn.Module):
                 found, status = anew, TrackStatus.recovered
                 self.forget()
             self._turned = person.time_s
-        # Without colours the way that the person faces is given at the start, not measured: none turns away unseen.
-        # Whose face is seen does not turn away either.
-        away = self.starter.turned_away(found) and (face or not person.faces.sought)
+        # Without colours the way that the person faces is given at the start, not measured: who does not walk away
+        # turns away unseen. Whose face is seen does not turn away either.
+        unseen = not person.faces.sought and person.walking is None
+        away = self.starter.turned_away(found) and (face or unseen)
         if not self.acceptable(found) or away:
             anew = self.starter(person.observation, person.faces, person.size, person.walking)
             if self.acceptable(anew):
