@@ -53,6 +53,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "size",
         "occlusion",
         "limb_search",
+        "limb_score",
         "start",
     ),
     "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "partition", "tracker"),
