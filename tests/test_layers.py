@@ -53,8 +53,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "size",
         "occlusion",
         "limb_search",
-        "limb_score",
         "start",
+        "limb_score",
     ),
     "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "partition", "tracker"),
     "activity": (

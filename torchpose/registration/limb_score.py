@@ -16,6 +16,7 @@ from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.limb_search import LEAST, LimbSearch
 from torchpose.registration.occlusion import OcclusionConfig, behind, entries
 from torchpose.registration.silhouette import silhouette_residual
+from torchpose.registration.start import picked
 from torchpose.registration.vem import Distance, Observation, Registrar
 
 
@@ -70,7 +71,7 @@ class LimbScore(nn.Module):
         posed = self.body(pose, size)
         pressed = self._pressed(posed, observation)
         square = rough_distance(pressed, points, config.visible).square()
-        F, K, N = square.shape
+        F, K = square.shape[:2]
         own = torch.zeros(len(self.parts), K, dtype=torch.bool, device=pose.device).scatter(
             1, self.parts, True
         )
@@ -164,6 +165,26 @@ class LimbScore(nn.Module):
         support[at] = far[:, few:].sum(2)
         terms, _ = pose_terms(self.body, pose, self.registrar.with_rest(nothing, support), config.fitting)
         return score + 0.5 * terms.square().sum((1, 2))
+
+    def nearer_half(
+        self,
+        observation: Observation,
+        pose: Float[Tensor, "rows parameters"],
+        size: Float[Tensor, "rows sizes"],
+        limb: Int[Tensor, " rows"],
+    ) -> Observation:
+        """Of each frame the half of its points that is nearer to a limb: what other limbs' points say does not move it.
+
+        A registrar with half the `effective_points` gives these their weights among all.
+        """
+        cloud = observation.cloud
+        posed = _chosen(self.body(pose, size), self.parts[limb])
+        away = rough_distance(posed, cloud.points, self.registrar.config.visible).amin(1)
+        away = torch.where(cloud.mask, away, torch.inf)
+        half = picked(observation, away.topk(-(-away.shape[1] // 2), 1, largest=False).indices)
+        count = (cloud.mask.sum(1, keepdim=True) + 1) // 2
+        own = torch.arange(half.cloud.mask.shape[1], device=limb.device) < count
+        return replace(half, cloud=replace(half.cloud, mask=half.cloud.mask & own))
 
     def _pressed(self, posed: PosedBody, observation: Observation) -> PosedBody:
         """The parts as `Registrar.correspond` takes them."""

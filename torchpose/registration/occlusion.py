@@ -51,7 +51,7 @@ def behind(
 def entries(
     posed: PosedBody, points: Float[Tensor, "batch num 3"]
 ) -> tuple[Float[Tensor, "batch parts num"], Float[Tensor, "batch parts num"]]:
-    """Where the points' rays enter each part, or come nearest to it, m of depth; and that, infinite where they miss it."""
+    """Where the points' rays enter each part, or come nearest, m of depth; and that, infinite where they miss it."""
     # Padding lies in the camera, where no ray begins: any will do.
     depth = torch.where(points[..., 2:] > 0, points[..., 2:], 1.0)
     ray = torch.cat([points[..., :2] / depth, torch.ones_like(depth)], -1)

@@ -103,6 +103,8 @@ class LimbHypotheses(nn.Module):
         alone = LabellingConfig(sweeps=0, potts=0.0)
         self.registrar = Registrar(body, replace(registrar.config, labelling=alone))
         self.search = LimbSearch(body, self.registrar, config.limbs)
+        effective = registrar.config.effective_points / 2  # see `nearer_half`
+        self.fitter = Registrar(body, replace(self.registrar.config, effective_points=effective))
         self.score = LimbScore(self.search, config.occlusion)
         names = [body.parameter_names[limb[0]] for limb in self.search.limbs.tolist()]
         # Arms compete for the same points, and so do legs: each limb and that of the other side.
@@ -301,8 +303,10 @@ class _Work:
             zip(frame.split(MOST), limb.split(MOST), start.split(MOST), strict=True) if len(frame) else ()
         ):
             hold = torch.full_like(p, HELD).scatter(1, self.limbs[k], 0.0)
-            found, _, _ = self.of.registrar.approach(
-                self.seen(t, p), p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
+            half = self.of.score.nearer_half(self.observation.share(t), p, self.size[t], k)
+            half = unoccluded(half, self.of.body(p, self.size[t]), config.occlusion)
+            found, _, _ = self.of.fitter.approach(
+                half, p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
             )
             out.append(torch.where(found.value.isfinite().all(1, keepdim=True), found.value, p))
         return torch.cat(out) if out else start
