@@ -54,6 +54,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "occlusion",
         "limb_search",
         "start",
+        "limb_score",
     ),
     "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "partition", "tracker"),
     "activity": (

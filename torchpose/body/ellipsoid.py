@@ -167,14 +167,19 @@ def surface_normal(
     return gradient / _length(gradient)
 
 
-def foot_point(posed: PosedBody, points: Float[Tensor, "batch num 3"], visible: bool = True) -> FootPoint:
+def foot_point(
+    posed: PosedBody, points: Float[Tensor, "batch num 3"], visible: bool = True, steps: int = NEWTON_STEPS
+) -> FootPoint:
     """The nearest point of every ellipsoid, or with `visible` the nearest one that the camera can see.
 
     A point whose nearest one faces away from the camera cannot have come from there. Of the visible side either the
     rim is then nearest, or the point across a flat ellipsoid (there is no third minimum), so the distance stays
     continuous where points cross over; taking the hit of the point's ray instead would make it jump.
+
+    Args:
+        steps: of Newton's method.
     """
-    return _foot_point(to_local(posed, points).mT, _shapes(posed, visible)[..., None], visible)
+    return _foot_point(to_local(posed, points).mT, _shapes(posed, visible)[..., None], visible, steps)
 
 
 def foot_of_part(

@@ -4,19 +4,24 @@ The hierarchical step (T. 6.2.1): the root is known, the chains outward are soug
 radians.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.ellipsoid import foot_point, rough_distance
+from torchpose.body.ellipsoid import FEW_STEPS, foot_point, rough_distance
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.registration.silhouette import silhouette_residual
 from torchpose.registration.vem import Observation, Registrar
 
 # A limb is a body on the root that others hang from: its joint, and that of the body after it, have four parameters.
 PARAMETERS = 4
+AT_ONCE = (
+    2**17
+)  # pairs of parts and points judged together to first order, and a sixth as many of those judged exactly
+LEAST = -80.0  # nats below the most that count as so many
 CLOSE = 1e6  # nats by which a place falls behind that is beside a better one
 
 
@@ -101,16 +106,27 @@ class LimbSearch(nn.Module):
         sizes = size.expand(B, -1).repeat_interleave(C, 0)
         limbs = _only(self.body(moved.flatten(0, 1), sizes), parts.flatten(), B)
         cloud, registrar = observation.cloud, self.registrar
-        if exact:
-            square = foot_point(limbs, cloud.points, registrar.config.visible).residual.square().sum(-1)
-        else:
-            square = rough_distance(limbs, cloud.points, registrar.config.visible).square()
-        square = square.unflatten(1, (C, *parts.shape))  # (B, C, L, own parts, N)
-        appearance = observation.potential.mT[:, None, parts]
-        inside = (appearance - square / (2 * self.config.sigma**2)).logsumexp(3)
         mask = cloud.mask[:, None, None]
         share = (registrar.config.effective_points / mask.sum(3).clamp_min(1)).clamp_max(1)
-        score = share * (torch.logaddexp(rest[:, None], inside) * mask).sum(3)
+        appearance = observation.potential.mT[:, None, parts]
+        # Larger tables leave the cache. An exact distance takes some with three coordinates of two points.
+        pairs = AT_ONCE // 6 if exact else AT_ONCE
+        together = max(1, pairs // (parts.numel() * cloud.mask.numel()))
+        bounds = []
+        for some in _pieces(limbs, together * parts.numel()):
+            if exact:
+                foot = foot_point(some, cloud.points, registrar.config.visible, FEW_STEPS)
+                square = foot.residual.square().sum(-1)
+            else:
+                square = rough_distance(some, cloud.points, registrar.config.visible).square()
+            square = square.unflatten(1, (-1, *parts.shape))  # (B, candidates, L, own parts, N)
+            inside = appearance - square / (2 * self.config.sigma**2)
+            # By hand: `exp` of what is 0 in single precision takes 20 times as long.
+            most = torch.maximum(inside.amax(3), rest[:, None])
+            total = (inside - most[:, :, :, None]).clamp_min_(LEAST).exp_().sum(3)
+            total = total + (rest[:, None] - most).clamp_min_(LEAST).exp_()
+            bounds.append(((most + total.log_()) * mask).sum(3))
+        score = share * torch.cat(bounds, 1)
         if registrar.config.rim.weight > 0:
             rims = silhouette_residual(
                 limbs, observation.nearest, observation.camera, registrar.config.rim, observation.frame
@@ -137,3 +153,10 @@ def _only(posed: PosedBody, parts: Int[Tensor, " own"], batch: int) -> PosedBody
     for name in ("centers", "frames", "radii"):
         one[name] = getattr(posed, name)[:, parts].unflatten(0, (batch, every)).flatten(1, 2)
     return PosedBody(**one)
+
+
+def _pieces(posed: PosedBody, size: int) -> Iterator[PosedBody]:
+    """Some of the ellipsoids at a time."""
+    for k in range(0, posed.centers.shape[1], size):
+        own = {name: getattr(posed, name)[:, k : k + size] for name in ("centers", "frames", "radii")}
+        yield replace(posed, **own)

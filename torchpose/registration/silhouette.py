@@ -89,8 +89,10 @@ def silhouette_residual(
 ) -> Float[Tensor, "batch rims"]:
     """The residuals of the `silhouette_rows`, no unit, for those who need no more: twice as fast."""
     points = outline(posed, config.rim_points).flatten(1, 2)
-    target, direction = _edge(points, nearest, camera, config, frame)
-    return (direction * (target - points)).sum(-1)
+    _, _, length, outside, depth = _beside(points, nearest, camera, frame)
+    metres = (length - MARGIN) * depth / camera.focal_length
+    # A row's target is drawn to by just so far as the rim stands out.
+    return -(config.weight**0.5 / config.sd) * (outside * metres.clamp_max(config.reach))
 
 
 def _edge(
@@ -101,27 +103,43 @@ def _edge(
     frame: Int[Tensor, " batch"] | None,
 ) -> tuple[Float[Tensor, "batch rims 3"], Float[Tensor, "batch rims 3"]]:
     """Where the mask's edge draws each rim point, m, and the direction along which that counts, 1/m."""
-    B = len(points)
-    depth = points[..., 2].clamp_min(0.1)
-    pixel = camera.project(torch.cat([points[..., :2], depth[..., None]], -1))
-    H, W = nearest.shape[1:3]
-    edge = torch.tensor([W - 1, H - 1], dtype=pixel.dtype, device=pixel.device)
-    seen = ((pixel > 0) & (pixel < edge)).all(-1)
-    # Rows that are not finite stay so, by `pixel`; their index must still be one.
-    index = pixel.detach().nan_to_num().round().clamp(min=torch.zeros_like(edge), max=edge).long()
-    if frame is None:
-        frame = torch.arange(B, device=index.device) if len(nearest) > 1 else index.new_zeros(B)
-    goal = nearest[frame[:, None], index[..., 1], index[..., 0]].to(points)
-    # From whole pixel to whole pixel: what rounding leaves of the rest must not turn the way.
-    unit = torch.nn.functional.normalize(index - goal, dim=-1)
-    length = ((pixel - goal) * unit).sum(-1)
-    outside = seen & (length > MARGIN)
+    goal, unit, length, outside, depth = _beside(points, nearest, camera, frame)
     # Along the ray the rim may move freely: the direction is that of the image plane, across the ray.
     across = torch.cat([unit, -(unit * points[..., :2]).sum(-1, keepdim=True) / depth[..., None]], -1)
     metres = (length - MARGIN) * depth / camera.focal_length
     pull = (config.reach / metres.clamp_min(config.reach)) * (config.weight**0.5 / config.sd)
     target = camera.back_project(goal + MARGIN * unit, depth)
     return target, across * (outside * pull)[..., None]
+
+
+def _beside(
+    points: Float[Tensor, "batch rims 3"],
+    nearest: Float[Tensor, "masks height width 2"],
+    camera: StereoCamera,
+    frame: Int[Tensor, " batch"] | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Of each rim point the mask's nearest pixel, the way from there, 1, how far it is, px, if beyond the mask's edge,
+    and its depth, m."""
+    B = len(points)
+    depth = points[..., 2].clamp_min(0.1)
+    H, W = nearest.shape[1:3]
+    # Each coordinate for itself: far faster than pairs of them.
+    place = camera.project(torch.cat([points[..., :2], depth[..., None]], -1)).unbind(-1)
+    last = (W - 1, H - 1)
+    seen = torch.stack([(x > 0) & (x < most) for x, most in zip(place, last, strict=True)]).all(0)
+    # Rows that are not finite stay so, by `place`; their index must still be one.
+    index = [
+        x.detach().nan_to_num().round().clamp(0, most).long() for x, most in zip(place, last, strict=True)
+    ]
+    if frame is None:
+        frame = torch.arange(B, device=points.device) if len(nearest) > 1 else index[0].new_zeros(B)
+    goal = nearest.flatten(0, 2)[(frame[:, None] * H + index[1]) * W + index[0]].to(points)
+    # From whole pixel to whole pixel: what rounding leaves of the rest must not turn the way.
+    way = [x - goal[..., i] for i, x in enumerate(index)]
+    far = (way[0].square() + way[1].square()).sqrt().clamp_min(1.0)
+    unit = [x / far for x in way]
+    length = (place[0] - goal[..., 0]) * unit[0] + (place[1] - goal[..., 1]) * unit[1]
+    return goal, torch.stack(unit, -1), length, seen & (length > MARGIN), depth
 
 
 def overhang(

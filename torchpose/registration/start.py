@@ -296,6 +296,12 @@ def thin(observation: Observation, num: int) -> Observation:
     even = (steps * (count - 1) / max(num - 1, 1)).round().long()
     order = cloud.mask.to(torch.uint8).argsort(dim=1, descending=True, stable=True)  # points before padding
     index = order.gather(1, torch.where(count > num, even, steps))
+    return replace(picked(observation, index), frame=None)
+
+
+def picked(observation: Observation, index: Int[Tensor, "batch few"]) -> Observation:
+    """Some of each frame's points; without neighbours, which this parts."""
+    cloud, num = observation.cloud, index.shape[1]
     wide = index[..., None].expand(-1, -1, 3)
     fewer = PointCloud(
         points=cloud.points.gather(1, wide),
@@ -306,4 +312,4 @@ def thin(observation: Observation, num: int) -> Observation:
     )
     parts = index[..., None].expand(-1, -1, observation.potential.shape[2])
     potential = observation.potential.gather(1, parts)
-    return replace(observation, cloud=fewer, potential=potential, geodesic=None, frame=None)
+    return replace(observation, cloud=fewer, potential=potential, geodesic=None)

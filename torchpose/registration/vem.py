@@ -131,7 +131,7 @@ class Observation:
             self.nearest,
             self.camera,
             geodesic,
-            self.frame,
+            None if self.frame is None else _rows(self.frame, batch),
             self.depth_noise,
         )
 
@@ -309,7 +309,7 @@ class Registrar(nn.Module):
         # Where depths are noisier than `ray_sd`, distances along the ray count for less: the body is taken flatter.
         seen, back = posed, None
         if observation.depth_noise > 0:
-            seen, back = flattened(posed, self._trust(posed, observation))
+            seen, back = flattened(posed, self.trust(posed, observation))
         if not config.hard:
             part = torch.arange(K, device=points.device)[:, None].expand(len(points), K, points.shape[1])
             foot = foot_point(seen, points, config.visible)
@@ -324,7 +324,7 @@ class Registrar(nn.Module):
             part, foot if back is None else unflattened(foot, posed, part, points, back), square
         )
 
-    def _trust(self, posed: PosedBody, observation: Observation) -> Float[Tensor, "batch parts"]:
+    def trust(self, posed: PosedBody, observation: Observation) -> Float[Tensor, "batch parts"]:
         """How much a distance along the ray counts at each part: less where it is noise of more than `ray_sd`."""
         noise = observation.depth_noise * posed.centers[..., 2].square()
         return self.config.ray_sd / noise.clamp_min(self.config.ray_sd)
@@ -427,7 +427,7 @@ class Registrar(nn.Module):
         if (
             observation.depth_noise > 0
         ):  # normals of the flatter body, which say little of where a limb may slide
-            trust = self._trust(posed, observation).gather(1, part)[:, None]
+            trust = self.trust(posed, observation).gather(1, part)[:, None]
             ray = nn.functional.normalize(posed.centers, dim=-1).mT.gather(2, part[:, None].expand(-1, 3, -1))
             normal = normal + (1 / trust - 1) * (ray * normal).sum(1, keepdim=True) * ray
             normal = nn.functional.normalize(normal, dim=1)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.labelling import LabellingConfig
+from torchpose.registration.limb_score import KnownBody, LimbScore
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
 from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
 from torchpose.registration.start import thin
@@ -21,6 +22,7 @@ from torchpose.registration.vem import Observation, Registrar, Registration
 from torchpose.tracking.trellis import best_sequence, spread, step_cost, weights
 
 MOST = 64  # rows registered at once: more are no faster
+SCORED = 128  # rows of which a limb alone is judged
 Candidates = Float[Tensor, "frames limbs candidates 4"]
 HELD = 1e6  # precision, rad and m, of the rest of the body while a limb is fitted
 
@@ -101,6 +103,9 @@ class LimbHypotheses(nn.Module):
         alone = LabellingConfig(sweeps=0, potts=0.0)
         self.registrar = Registrar(body, replace(registrar.config, labelling=alone))
         self.search = LimbSearch(body, self.registrar, config.limbs)
+        effective = registrar.config.effective_points / 2  # see `nearer_half`
+        self.fitter = Registrar(body, replace(self.registrar.config, effective_points=effective))
+        self.score = LimbScore(self.search, config.occlusion)
         names = [body.parameter_names[limb[0]] for limb in self.search.limbs.tolist()]
         # Arms compete for the same points, and so do legs: each limb and that of the other side.
         kinds = [_unsided(name) for name in names]
@@ -231,14 +236,15 @@ class _Work:
         """With new places: the best few of those that differ from what is there, as they are and fitted."""
         config = self.of.config
         new = self._new(table, place)
-        raw = self._cost(pose, place, new)
+        known = self._known(pose, new)
+        raw = self._cost(pose, place, new, known)
         few = Table(place, raw).best(config.fits, config.apart, torch.inf)
         open_ = few.cost < table.cost[..., :1] + 4 * config.hopeless
         frame, limb, slot = open_.nonzero(as_tuple=True)
         fitted = few.place.clone()
         start = pose[frame].scatter(1, self.limbs[limb], few.place[frame, limb, slot])
         fitted[frame, limb, slot] = self._fit(frame, limb, start).gather(1, self.limbs[limb])
-        cost = self._cost(pose, fitted, open_)
+        cost = self._cost(pose, fitted, open_, known)
         together = Table(
             torch.cat([table.place, few.place, fitted], 2),
             torch.cat([table.cost, torch.where(open_, few.cost, torch.inf), cost], 2),
@@ -259,17 +265,36 @@ class _Work:
             known = torch.cat([known, torch.where(new[-1][..., None], one, torch.nan)[:, :, None]], 2)
         return torch.stack(new, 2)
 
+    def _known(
+        self, pose: Float[Tensor, "frames parameters"], some: Bool[Tensor, "frames limbs candidates"]
+    ) -> tuple[KnownBody, Tensor] | None:
+        """The frames with places to be judged; None where this takes the whole registrar."""
+        frames = some.flatten(1).any(1).nonzero()[:, 0]
+        if len(frames) == 0 or not self.of.score.serves(self.of.registrar):
+            return None
+        row = frames.new_zeros(len(pose)).index_put(
+            (frames,), torch.arange(len(frames), device=frames.device)
+        )
+        return self.of.score.know(self.observation.share(frames), pose[frames], self.size[frames]), row
+
     def _cost(
         self,
         pose: Float[Tensor, "frames parameters"],
         place: Candidates,
         some: Bool[Tensor, "frames limbs candidates"],
+        known: tuple[KnownBody, Tensor] | None,
     ) -> Float[Tensor, "frames limbs candidates"]:
         """Of some places on the believed rest of the body; the others' are infinite."""
         frame, limb, slot = some.nonzero(as_tuple=True)
-        posed = pose[frame].scatter(1, self.limbs[limb], place[frame, limb, slot])
+        own = place[frame, limb, slot]
         cost = place.new_full(place.shape[:3], torch.inf)
-        cost[frame, limb, slot] = self.nats(frame, posed).nan_to_num(nan=torch.inf)
+        if known is None:
+            nats = self.nats(frame, pose[frame].scatter(1, self.limbs[limb], own))
+        else:
+            body, row = known
+            pieces = zip(row[frame].split(SCORED), limb.split(SCORED), own.split(SCORED), strict=True)
+            nats = torch.cat([self.of.score(body, *piece, self.rest_share) for piece in pieces])
+        cost[frame, limb, slot] = nats.nan_to_num(nan=torch.inf)
         return cost
 
     def _fit(self, frame: Tensor, limb: Tensor, start: Tensor) -> Tensor:
@@ -278,8 +303,10 @@ class _Work:
             zip(frame.split(MOST), limb.split(MOST), start.split(MOST), strict=True) if len(frame) else ()
         ):
             hold = torch.full_like(p, HELD).scatter(1, self.limbs[k], 0.0)
-            found, _, _ = self.of.registrar.approach(
-                self.seen(t, p), p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
+            half = self.of.score.nearer_half(self.observation.share(t), p, self.size[t], k)
+            half = unoccluded(half, self.of.body(p, self.size[t]), config.occlusion)
+            found, _, _ = self.of.fitter.approach(
+                half, p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
             )
             out.append(torch.where(found.value.isfinite().all(1, keepdim=True), found.value, p))
         return torch.cat(out) if out else start
@@ -288,7 +315,8 @@ class _Work:
         self, table: Table, pose: Float[Tensor, "frames parameters"], some: Bool[Tensor, "frames limbs"]
     ) -> Table:
         """With the costs of some limbs in some frames anew, since the limb beside it moved."""
-        cost = self._cost(pose, table.place, table.cost.isfinite() & some[..., None])
+        which = table.cost.isfinite() & some[..., None]
+        cost = self._cost(pose, table.place, which, self._known(pose, which))
         return Table(table.place, torch.where(some[..., None], cost, table.cost))
 
 
