@@ -61,7 +61,7 @@ class EyesConfig:
     farthest: float = 8.0  # m
     background_frames: int = 15  # of the recording, from which the empty scene is learned if none is given
     depth_frames: int = 40  # the same for a depth camera, whose frames cost nothing and whose noise is large
-    disparity_sd: float = 0.25  # px, of a matched disparity
+    disparity_sd: float = 0.15  # px, of a matched disparity, on surfaces as smooth as a person
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     empty_scene: EmptySceneConfig = field(default_factory=EmptySceneConfig)
     depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)

@@ -64,7 +64,7 @@ class RegistrationConfig:
     robust_sd: float = 0.05  # m, at which a residual loses three quarters of its weight; 0 weighs all alike
     noise_sd: float = 0.02  # m, of a point in the M-step
     ray_sd: float = (
-        0.06  # m along the ray, up to which the settings above hold; noisier points count as if so far off
+        0.03  # m along the ray, up to which the settings above hold; noisier points count as if so far off
     )
     effective_points: float = 150.0  # what the correlated points are worth as independent ones
     rest_sd: float = 0.5  # rad, of the pull to the rest pose on joints of which nothing is seen; 0 is none
