@@ -61,9 +61,10 @@ def test_the_height_is_the_second_tallest_of_upright_sights(people):
     model = people.model
     H = model.body.height
     assert model.height_of([]) == H
-    assert model.height_of([0.6 * H, 0.8 * H]) == H  # sitting
-    assert_close(model.height_of([1.60, 0.7 * H]), 1.60 + RIM)
-    assert_close(model.height_of([1.60, 1.62, 1.95]), 1.62 + RIM)
+    assert model.height_of([0.6 * H, 0.7 * H]) == H  # sitting
+    assert model.height_of([float("nan"), 0.8 * H]) == model.config.least_height
+    assert_close(model.height_of([1.70, 0.7 * H]), 1.70 + RIM)
+    assert_close(model.height_of([1.70, 1.72, 1.95]), 1.72 + RIM)
     assert model.height_of([3.0, 3.0]) == 1.2 * H
 
 

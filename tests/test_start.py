@@ -185,7 +185,8 @@ def test_limbs_that_hardly_differ_from_those_of_better_starts_are_not_exchanged_
     left = [i for i, name in enumerate(body.parameter_names) if "arm_left" in name]
     poses[0, :, left] += torch.tensor([0.0, 0.05, 0.15, 0.02])[:, None]
     score = torch.tensor([3.0, 1.0, 2.0, 0.0]).expand(2, 4)
-    combined, new = starter._exchange(poses, score, ("upper_arm", "forearm"))
+    some = Starter(body, replace(starter.config, apart=0.05), RegistrationConfig())
+    combined, new = some._exchange(poses, score, ("upper_arm", "forearm"))
     moved = combined[0, new[0]][:, left] - standing(body)[:, left]
     assert_close(moved, torch.full((1, len(left)), 0.15))
     assert not new[1].any()  # the other frame's starts are all alike
