@@ -114,6 +114,50 @@ def test_the_extent_of_rows_is_1_of_an_even_spread_and_less_of_a_piece():
     assert (extent[[0, 1, 3, 4, 5, 7, 8, 10, 11, 12, 13]] == 0).all()
 
 
+def test_the_reach_of_rows_is_1_where_all_of_a_part_shows_and_little_near_its_joint():
+    """Mean squares of the distances from the joint along the part, weighed by the directions' squares, by hand."""
+    body = body_of()
+    pose, size = random_pose(body, 1), random_size(body)
+    posed = body(pose, size)
+    half = posed.radii[0, :, 2]
+    joints = posed.origins[:, body.carriers[: body.num_parts]]
+    start = ((joints - posed.centers)[0, :, None] @ posed.frames[0])[:, 0, 2]  # of each part's own axis
+    away = half.double() * torch.sign(-start)  # which end is the far one
+    places = torch.stack(
+        [
+            torch.linspace(-1, 1, 2001, dtype=torch.float64) * half[2],
+            start[9] + torch.linspace(0, 0.3, 2001, dtype=torch.float64) * away[9],
+            start[6] + torch.linspace(1, 2, 2001, dtype=torch.float64) * away[6],
+        ]
+    )
+    local = torch.zeros(3, 2001, 3, dtype=torch.float64)
+    local[..., 2] = places
+    part = torch.tensor([2, 9, 6]).repeat_interleave(2001)[None]
+    direction = torch.randn(1, 6003, 3, dtype=torch.float64)
+    rows = Rows(part, local.view(1, -1, 3), torch.zeros(1, 6003, 3, dtype=torch.float64), direction)
+    weight = direction[0].square().sum(1).view(3, -1)
+    from_joint = (places - start[[2, 9, 6]][:, None]).square()
+    mean = (weight * from_joint).sum(1) / weight.sum(1)
+    expected = mean / (start[[2, 9, 6]].square() + half[[2, 9, 6]].square() / 3)
+    reach = MomentEquations(sums_of(rows, posed), body.part_moves).reach(posed, joints)[0]
+    assert_close(reach[[2, 9, 6]], expected.clamp_max(1), rtol=1e-9, atol=0)
+    assert abs(float(reach[2]) - 1) < 0.05
+    assert reach[9] < 0.1
+    assert reach[6] == 1
+    assert (reach[[0, 1, 3, 4, 5, 7, 8, 10, 11, 12, 13]] == 0).all()
+
+
+@each_kind
+def test_weights_of_parts_are_those_of_their_rows_squares(kind):
+    body, truth, size, rows = scene(kind)
+    posed = body(truth, size)
+    weight = torch.rand(2, body.num_parts, dtype=torch.float64)
+    found = MomentEquations(sums_of(rows, posed), body.part_moves).weighted(weight)(posed)
+    scaled = replace(rows, direction=rows.direction * weight.gather(1, rows.part)[..., None].sqrt())
+    expected = MomentEquations(sums_of(scaled, posed), body.part_moves)(posed)
+    assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+
+
 def row(rows, b):
     return Rows(*(getattr(rows, name)[b : b + 1] for name in ROW_FIELDS))
 
@@ -223,3 +267,4 @@ def test_no_rows_say_nothing():
     assert (equations(posed) == 0).all()
     assert (equations.by_offset(posed) == 0).all()
     assert (equations.extent(posed) == 0).all()
+    assert (equations.reach(posed, posed.centers) == 0).all()

@@ -218,6 +218,34 @@ def test_a_limb_of_which_only_the_top_shows_turns_by_more_than_one_that_shows_in
     assert (sds[1][raised] > 2 * sds[0][raised]).all()
 
 
+def test_points_near_a_joint_alone_count_once_in_a_while_and_rest_in_every_frame_then(body, scene):
+    """With the legs hidden but for their tops: at twice the frame rate a frame says half as much of a thigh, as its
+    errors are those of the frame before; of an arm in full view it says as much as before.
+    """
+    pose, observation, _, _ = scene
+    below = observation.cloud.points[..., 1] - body(pose).joints[:, 9:11, 1].mean(1)[:, None]
+    cloud = replace(observation.cloud, mask=observation.cloud.mask & (below < 0.1))
+    observation, size = replace(observation, cloud=cloud), body.default_size(1)
+    smoother = Smoother(body, Registrar(body, RegistrationConfig(rim=RimConfig(weight=0.0))))  # points alone
+
+    def each(rate):
+        equations = smoother._equations(observation, pose, size, torch.arange(6).double() / rate)
+        told = equations.of_rows(body(pose, size))[:, :-1, :-1].diagonal(dim1=1, dim2=2)
+        return told.mean(0), equations.prior.precision.mean(0)
+
+    slow, fast = each(10), each(20)
+    thigh = [i for i, name in enumerate(body.parameter_names) if name.startswith("thigh")]
+    shank = [i for i, name in enumerate(body.parameter_names) if name.startswith("shank")]
+    assert (slow[0][thigh] > 0.1).all()  # there are points
+    assert_close(fast[0][thigh] / slow[0][thigh], torch.full((4,), 0.5).to(slow[0]), rtol=0, atol=0.1)
+    assert_close(fast[0][arm(body)], slow[0][arm(body)], rtol=0.15, atol=0)
+    # The pull to rest is whole on what is not seen, as if there were one frame, and is thinned out where all is.
+    alone = smoother._equations(observation, pose, size, torch.zeros(1).double()).prior.precision.mean(0)
+    assert_close(fast[1][shank], alone[shank], rtol=1e-6, atol=0)
+    assert (fast[1][thigh] > 0.8 * alone[thigh]).all()
+    assert (fast[1][arm(body)] < 0.4 * alone[arm(body)]).all()
+
+
 def test_unseen_frames_lie_between_their_neighbours_and_less_surely_the_farther_these_are():
     """A Brownian bridge: over n steps of variance q, after k of them, the variance is q k (n - k) / n."""
     T, q = 9, 0.04

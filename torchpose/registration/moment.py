@@ -10,7 +10,7 @@ With T_0 the frame at the start nothing large cancels in single precision: what 
 what it is multiplied by is how far the part has moved since. Camera's frame, metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -113,12 +113,37 @@ class MomentEquations:
 
         The weights are the directions' squares; a part without rows has 0.
         """
+        first, square, seen = self._along()
+        variance = torch.where(seen, square - first.square(), 0.0).clamp_min(0)
+        return 3 * variance / posed.radii[..., 2].square()
+
+    def reach(self, posed: PosedBody, joint: Float[Tensor, "batch parts 3"]) -> Float[Tensor, "batch parts"]:
+        """How far the rows of each part are from its joint along it: their mean square to an even spread's, at most 1.
+
+        It is what they say of the part's direction to what they would say if all of it showed. The weights are the
+        directions' squares; a part without rows has 0.
+
+        Args:
+            joint: m, that each part turns about.
+        """
+        first, square, seen = self._along()
+        start = ((joint - posed.centers) * posed.frames[..., 2]).sum(-1)
+        away = torch.where(seen, square - 2 * start * first + start.square(), 0.0)
+        return (away / (start.square() + posed.radii[..., 2].square() / 3)).clamp(0, 1)
+
+    def _along(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean and mean square of the rows' places along each part, m from its centre, and whether there are any."""
         z, one = [2, 6, 10], SHIFT  # the entries n h_2 and n of a: their products, added over n
         matrix = self.moments.matrix
         square, first, weight = (matrix[..., i, j].sum(-1) for i, j in ((z, z), (z, one), (one, one)))
-        weight = torch.where(weight > 0, weight, 1.0)
-        variance = (square / weight - (first / weight).square()).clamp_min(0)
-        return 3 * variance / posed.radii[..., 2].square()
+        seen = weight > 0
+        weight = torch.where(seen, weight, 1.0)
+        return first / weight, square / weight, seen
+
+    def weighted(self, weight: Float[Tensor, "batch parts"]) -> "MomentEquations":
+        """With the squares of each part's rows times a weight."""
+        matrix = self.moments.matrix * weight[..., None, None]
+        return replace(self, moments=replace(self.moments, matrix=matrix))
 
     def _columns(self, posed: PosedBody) -> Float[Tensor, "batch parts 13 parameters_1"]:
         """What the derivatives by the parameters, and the residual, take of each part's a."""
