@@ -295,4 +295,5 @@ def test_a_run_without_a_pose_has_no_misfit_to_tell() -> None:
         "point_to_model_m": {"mean": math.nan},
     }
     rest = {"seconds": 1.0, "seconds_per_frame": 0.5, "cpu_ms_per_frame": {}, "problems": [], "others": []}
-    assert "point to model    -\n" in summary_table(summary | rest, Path("out"))
+    rest |= {"files": ["poses.csv"]}
+    assert "point to model    -\n" in summary_table(summary | rest, Path("out"), 80)

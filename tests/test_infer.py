@@ -153,11 +153,11 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 def test_other_settings_start_over(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     model = tp.People(tp.StereoToPose(tp.open_recording(folder).camera))
     run = session.Session(model, tp.open_recording(folder), tmp_path, {"a": 1}, "1")
-    assert run._resume(fresh=False) == 0
-    (run.parts / "poses_00000002.npz").write_bytes(b"")
+    assert run.begin(fresh=False) == 0
+    (run.parts.folder / "poses_00000002.npz").write_bytes(b"")
     other = session.Session(model, tp.open_recording(folder), tmp_path, {"a": 2}, "1")
-    assert other._resume(fresh=False) == 0
-    assert not list(run.parts.glob("poses_*"))
+    assert other.begin(fresh=False) == 0
+    assert other.parts.ends == []
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("registration/*.yaml")), ids=lambda path: path.stem)
