@@ -1,5 +1,6 @@
 """Settings: from YAML and the command line into frozen dataclasses, and every mistake by its message."""
 
+import dataclasses
 import re
 import subprocess
 import sys

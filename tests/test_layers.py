@@ -78,7 +78,20 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
         *("export", "figures", "timeline", "journal", "activities"),
-        *("eyes", "pipeline", "window", "people", "parts", "overlay", "session", "clips", "study", "cli"),
+        *(
+            "eyes",
+            "pipeline",
+            "window",
+            "people",
+            "parts",
+            "overlay",
+            "session",
+            "web_view",
+            "live",
+            "clips",
+            "study",
+            "cli",
+        ),
     ),
 }
 ORDER = [

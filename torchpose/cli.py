@@ -23,9 +23,11 @@ from torchpose.activity.features import FeatureKind
 from torchpose.activity.recognizer import RecognizerConfig
 from torchpose.aligned import AlignedRecording, align_recording
 from torchpose.atomic import require_writable
+from torchpose.body.model import BodyModel
 from torchpose.capture import camera_numbers, capture_recording, open_cameras
 from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.eyes import EyesConfig
+from torchpose.live import LiveConfig, LiveRun
 from torchpose.manual import full_help, short_help
 from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
@@ -65,7 +67,7 @@ class InferConfig:
     calibration: str | None = None  # its file, instead of the folder's own; a video or a camera needs one
     background: str | None = None  # folder with images of the empty scene, instead of the folder's own
     output: str = "runs/infer"  # folder for the results
-    max_frames: int | None = None  # take only the first so many frames; a camera needs it
+    max_frames: int | None = None  # take only the first so many frames; record_first needs it
     record_first: bool = (
         False  # a camera is recorded, max_frames of it, and then run, instead of followed live
     )
@@ -78,6 +80,7 @@ class InferConfig:
     eyes: EyesConfig = field(default_factory=EyesConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     people: PeopleConfig = field(default_factory=PeopleConfig)
+    live: LiveConfig = field(default_factory=LiveConfig)
     recognizer: str | None = (
         None  # folder of a trained one, runs/train/recognizers/angles: writes activities.csv
     )
@@ -93,9 +96,9 @@ class InferConfig:
         if self.recording is None and given:
             raise ValueError(f"{given[0]} must come with a recording, got none; give recording=PATH as well")
         if self.recording is not None and camera_numbers(self.recording) is not None:
-            for name in ("calibration", "max_frames"):
+            for name in ("calibration", "max_frames") if self.record_first else ("calibration",):
                 if getattr(self, name) is None:
-                    raise ValueError(f"{name} must be given for a live camera, got null; add {name}=")
+                    raise ValueError(f"{name} must be given for a camera, got null; add {name}=")
             if self.right is not None:
                 raise ValueError(
                     f"right must be a video beside a left one, got {self.right} beside a camera; leave it out"
@@ -208,6 +211,24 @@ def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
     output, settings = Path(config.output), settings_of(config)
     activities = _activities(config)
+
+    def session_of(recording: Recording, rows_before: float | None) -> Session:
+        model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
+        return Session(People(model, config.people), recording, output, settings, __version__, rows_before)
+
+    camera = None if config.recording is None else camera_numbers(config.recording)
+    if camera is not None and not config.record_first:
+        summary = _follow_live(config, camera, output, session_of)
+    else:
+        recording, rows_before = _open(config, output)
+        summary = session_of(recording, rows_before).run(config.fresh, config.max_frames)
+    print(summary_table(summary, output, width()))
+    if activities is not None:
+        print(activity_lines(activities.write(output, BodyModel(config.pose.body), str(output.resolve()))))
+
+
+def _open(config: InferConfig, output: Path) -> tuple[Recording, float | None]:
+    """The recording with its rows corrected and its images shrunk, and how far apart its rows were, px."""
     if config.recording is None:
         print("no recording given: making one (recording=DIR runs yours)")
         recording: Recording = demo_recording(config.seed)
@@ -222,12 +243,41 @@ def infer(config: InferConfig, device: torch.device) -> None:
         if isinstance(recording, AlignedRecording):
             shrunk = min(1.0, config.max_width / recording.camera.width)
             rows_before = recording.alignment.typical * shrunk
-    recording = at_most(recording, config.max_width)
-    model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    session = Session(People(model, config.people), recording, output, settings, __version__, rows_before)
-    print(summary_table(session.run(config.fresh, config.max_frames), output, width()))
-    if activities is not None:
-        print(activity_lines(activities.write(output, model.body, str(output.resolve()))))
+    return at_most(recording, config.max_width), rows_before
+
+
+def _follow_live(
+    config: InferConfig,
+    camera: tuple[int, ...],
+    output: Path,
+    session_of: Callable[[Recording, float | None], Session],
+) -> dict[str, Any]:
+    """The summary of a camera that is followed live, or of the files of one that was before they could be written."""
+    assert config.calibration is not None
+    folder, interrupted = output / "recording", is_interrupted(output, settings_of(config), __version__)
+    live = LiveRun(
+        folder,
+        Path(config.calibration),
+        config.live,
+        session_of,
+        config.max_width,
+        config.align,
+        config.background,
+        config.max_frames,
+    )
+    if interrupted and folder.is_dir() and not config.fresh:
+        summary = live.resume()
+        if summary is not None:
+            return summary
+    devices = open_cameras(camera)
+    try:
+        require_writable(output)
+        if config.fresh:
+            shutil.rmtree(folder, ignore_errors=True)
+        return live.run(devices)
+    finally:
+        for device in devices:
+            device.release()
 
 
 def _activities(config: InferConfig) -> ActivityWriter | None:

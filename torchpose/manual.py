@@ -13,8 +13,8 @@ _SETTING = 34  # columns; the meaning of a longer setting goes below it
 EXAMPLES: dict[str, str] = {
     "infer": """
 python infer.py                                      a recording that the package makes itself
-python infer.py recording=DIR output=DIR             yours: a folder with left/, right/, calibration.yaml
-python infer.py recording=camera:0 calibration=FILE  a side-by-side camera, live in the browser
+python infer.py recording=DIR output=DIR             yours: left/, right/, calibration.yaml
+python infer.py recording=camera:0 calibration=FILE  a camera, live, with a page to look at
 """,
     "train": """
 python train.py                                      a small database that the package makes itself
@@ -63,8 +63,8 @@ def short_help(kind: str, config: object) -> str:
             *("", "Settings that matter first, with their defaults"),
             *_settings(rows[name] for name in FIRST[kind] if name in rows),
             "",
-            f"An interrupted run goes on when the command is given again; --fresh starts over. --help-all lists all\n"
-            f"{len(rows)} settings.",
+            f"An interrupted run goes on when the command is given again; --fresh starts over. \n"
+            f"--help-all lists all {len(rows)} settings.",
         ]
     )
 
@@ -82,10 +82,12 @@ def full_help(kind: str, config: object, groups: Mapping[str, Sequence[str]]) ->
 
 def sections(config: object, prefix: str = "") -> Iterator[tuple[str, list[tuple[str, str]]]]:
     """Headings, and the settings with their meanings under each: the configuration's own, then those below it."""
-    words = (inspect.getdoc(type(config)) or "").split("\n\n")[0].replace("\n", " ").rstrip(".")
+    words = (inspect.getdoc(type(config)) or "").replace("\n", " ").partition(". ")[0].rstrip(".")
+    if words.startswith(type(config).__name__):  # what dataclasses make up where there is no docstring
+        words = ""
     own = [row for row in setting_rows(config, prefix) if "." not in row[0].partition("=")[0][len(prefix) :]]
     if own:
-        yield f"{prefix.rstrip('.')}: {words}" if prefix else "The command", own
+        yield textwrap.shorten(f"{prefix[:-1]}: {words}", COLUMNS) if prefix else "The command", own
     for field in dataclasses.fields(config):  # type: ignore[arg-type]
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):

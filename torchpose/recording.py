@@ -123,7 +123,7 @@ class FolderRecording:
         if "depth" in images:
             colour = images.get("colour")
             return Frame(index, time_s, None if colour is None else colour[0], depth=images["depth"][0])
-        left, right = _rectify(self.calibration, images["left"], images["right"])
+        left, right = rectify_pair(self.calibration, images["left"], images["right"])
         return Frame(index, time_s, left[0], right[0])
 
     def background(self) -> Backgrounds:
@@ -131,7 +131,7 @@ class FolderRecording:
 
         Raises ValueError where one cannot be read, or where the left and the right ones do not pair up.
         """
-        return _backgrounds(self.background_folder, self.calibration)
+        return read_backgrounds(self.background_folder, self.calibration)
 
     def _read(self, stream: str, path: Path) -> Float[Tensor, "*channels height width"]:
         return _read_image(path, self.calibration, stream == "depth")
@@ -194,12 +194,12 @@ class VideoRecording:
             raise UnreadableFrame(f"frame {index} cannot be read: {error}", index, time_s) from None
         eyes = pixels if len(pixels) == 2 else np.split(pixels[0], 2, axis=1)
         left, right = (to_colour(eye)[None] for eye in eyes)
-        left, right = _rectify(self.calibration, left, right)
+        left, right = rectify_pair(self.calibration, left, right)
         return Frame(index, time_s, left[0], right[0])
 
     def background(self) -> Backgrounds:
         """The frames of the empty scene; none where there is no folder of them."""
-        return _backgrounds(self._background, self.calibration) if self._background else Backgrounds()
+        return read_backgrounds(self._background, self.calibration) if self._background else Backgrounds()
 
     def _check_sizes(self) -> None:
         camera, single = self.camera, len(self._videos) == 1
@@ -423,18 +423,19 @@ def _paired_files(folder: Path, streams: list[str]) -> dict[str, dict[int, Path]
     return found
 
 
-def _rectify(
+def rectify_pair(
     calibration: Calibration,
     left: Float[Tensor, "num 3 height width"],
     right: Float[Tensor, "num 3 height width"],
 ) -> tuple[Float[Tensor, "num 3 height width"], Float[Tensor, "num 3 height width"]]:
+    """Left and right images as the calibration's rectified camera would see them; as they are where that took them."""
     if calibration.raw is None:
         return left, right
     left, right, _ = calibration.raw.rectify(left, right)
     return left, right
 
 
-def _backgrounds(folder: Path, calibration: Calibration) -> Backgrounds:
+def read_backgrounds(folder: Path, calibration: Calibration) -> Backgrounds:
     """The frames of the empty scene in a folder; ValueError where one cannot be read or has no partner."""
 
     def stack(files: Mapping[int, Path], depth: bool = False) -> Float[Tensor, "num *channels height width"]:
@@ -451,7 +452,7 @@ def _backgrounds(folder: Path, calibration: Calibration) -> Backgrounds:
         )
     if not left:
         return Backgrounds()
-    return Backgrounds(*_rectify(calibration, stack(left), stack(right)))
+    return Backgrounds(*rectify_pair(calibration, stack(left), stack(right)))
 
 
 def _read_image(

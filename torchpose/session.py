@@ -82,7 +82,7 @@ class Session:
         """
         begin, count = time.perf_counter(), min(len(self.recording), max_frames or len(self.recording))
         done = self.begin(fresh, count)
-        rows_apart = self._check_rows()
+        rows_apart = self.check_rows(self.recording)
         if done < count:
             self.people.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
             self.follow(range(done, count), count)
@@ -180,12 +180,12 @@ class Session:
         for file in files:
             os.replace(file, self.output / file.name)
 
-    def _check_rows(self) -> float | None:
+    def check_rows(self, recording: Recording) -> float | None:
         """How far apart the rows of a recording's left and right images are, px, with a warning where it spoils depth.
 
         A correction is told, too. None for a depth camera, and where too few points are seen in both images.
         """
-        frames = list(readable_frames(self.recording, spread_positions(len(self.recording), CHECKED)))
+        frames = list(readable_frames(recording, spread_positions(len(recording), CHECKED)))
         left = [frame.left for frame in frames if frame.left is not None]
         right = [frame.right for frame in frames if frame.right is not None]
         if not right:
@@ -312,6 +312,14 @@ def summary_table(summary: Mapping[str, Any], output: Path, columns: int) -> str
         ("CPU ms a frame", ", ".join(f"{name} {ms:.0f}" for name, ms in stages)),
         ("results", f"{output}/ {', '.join(summary['files'])}"),
     ]
+    if "live" in summary:
+        live = summary["live"]
+        words = (
+            f"{live['offered']} pairs in {live['seconds']:.1f} s: {live['followed']} followed, {live['dropped']} "
+            f"dropped ({100 * live['drop_rate']:.1f} %), {live['missed_by_camera']} missed by the camera; "
+            "recording/ has all that came"
+        )
+        rows.insert(1, ("live", words))
     lines = table(rows, columns, most=3)
     problems = summary["problems"]
     told = [("problem", problem) for problem in problems[:_MOST_PROBLEMS]]

@@ -68,7 +68,7 @@ def config_groups(folder: Path, name: str) -> dict[str, list[str]]:
 
 
 def setting_rows(config: object, prefix: str = "") -> list[tuple[str, str]]:
-    """Every setting of a dataclass as `key=value` with its meaning, the comment in its source; nested ones come last."""
+    """Every setting of a dataclass as `key=value` with its meaning, the comment beside it; nested ones come last."""
     return list(_rows(config, prefix))
 
 
