@@ -325,3 +325,29 @@ def test_sigterm_is_taken_like_ctrl_c(folder: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(tp.People, "step", lambda s, r, p: seen.append(p) or step(s, r, p))
     assert infer_main([*command, "max_frames=4", "--fresh"]) == 0
     assert seen == [0, 1, 2, 3]
+
+
+def test_the_summary_fits_a_screen(tmp_path: Path):
+    """24 lines of 80 columns at the worst: four people, a live run, forty problems."""
+    status = dict.fromkeys(("absent", "entering", "tracked", "partial", "recovered", "lost"), 100_000)
+    stages = ("background", "stereo", "silhouette", "points", "faces", "size", "people", "registration")
+    summary = {
+        "frames": 600_000,
+        "status": status,
+        "answered": 0.5,
+        "point_to_model_m": {"mean": 0.01},
+        "seconds": 1e5,
+        "seconds_per_frame": 0.2,
+        "cpu_ms_per_frame": {**dict.fromkeys(stages, 123.0), "smoothing": 1.0, "export": 1.0},
+        "others": [status] * 3,
+        "files": [f"{kind}{n}" for kind in ("poses.csv", "poses.npz", "angles.png") for n in range(9)],
+        "problems": [f"frame {n} cannot be read: {'x' * 60} must be a whole image" for n in range(40)],
+        "live": {
+            **{"offered": 10**6, "seconds": 1e5, "followed": 10**5, "dropped": 9 * 10**5},
+            **{"drop_rate": 0.9, "missed_by_camera": 12},
+        },
+    }
+    lines = module.summary_table(summary, tmp_path, 80).splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
+    assert lines[-1].strip() == "and 37 more, see summary.json"

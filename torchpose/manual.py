@@ -17,14 +17,14 @@ python infer.py recording=DIR output=DIR             yours: left/, right/, calib
 python infer.py recording=camera:0 calibration=FILE  a camera, live, with a page to look at
 """,
     "train": """
-python train.py                                      a small database that the package makes itself
+python train.py                                      a small database that the package makes
 python train.py experiment=thesis                    the whole of it, as in the thesis: hours
 python train.py experiment=skeleton data.path=FILE   a skeleton data set
 """,
 }
 FILES: dict[str, str] = {
     "infer": """
-poses.csv      a row a frame: joints in m, joint angles in degrees with standard deviations, status
+poses.csv      a row a frame: joints in m, angles in degrees with standard deviations, status
 poses.npz      the same and more, in full precision
 overlay.mp4    the model over the images
 angles.png     the joint angles over time, with bands of two standard deviations
@@ -63,7 +63,7 @@ def short_help(kind: str, config: object) -> str:
             *("", "Settings that matter first, with their defaults"),
             *_settings(rows[name] for name in FIRST[kind] if name in rows),
             "",
-            f"An interrupted run goes on when the command is given again; --fresh starts over. \n"
+            f"An interrupted run goes on when the command is given again; --fresh starts over.\n"
             f"--help-all lists all {len(rows)} settings.",
         ]
     )
@@ -99,7 +99,8 @@ def _settings(rows: Iterable[tuple[str, str]]) -> list[str]:
     for setting, meaning in rows:
         wrapped = textwrap.wrap(meaning, COLUMNS - _SETTING - 4) or [""]
         if len(setting) > _SETTING:
-            lines.append(f"  {setting}")
+            head, _, tail = setting.partition("=")  # a list may be longer than a line
+            lines += [f"  {setting}"] if len(setting) < COLUMNS - 2 else [f"  {head}=", f"    {tail}"]
             setting = ""
         lines += [
             f"  {setting if i == 0 else '':<{_SETTING}}  {line}".rstrip() for i, line in enumerate(wrapped)

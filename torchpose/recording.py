@@ -231,13 +231,14 @@ class VideoRecording:
         if lengths[0] != lengths[-1]:
             warnings.warn(
                 f"of {lengths[0]} and {lengths[1]} frames in {names} the last {max(lengths) - min(lengths)} have no "
-                "partner and are left out",
+                "partner and are left out; where they matter, cut both videos to the same moments",
                 stacklevel=3,
             )
         if not _same_rate(rates[0], self.camera.frame_rate):
             warnings.warn(
                 f"{self._videos[0].path} has {rates[0]:.4g} frames a second and the calibration says "
-                f"{self.camera.frame_rate:.4g}: times are by the calibration",
+                f"{self.camera.frame_rate:.4g}: times are by the calibration; where the video is right, "
+                "correct frame_rate there",
                 stacklevel=3,
             )
 
@@ -316,7 +317,7 @@ def _with_focal_length(recording: FolderRecording, height: float) -> FolderRecor
         raise ValueError(f"{recording.folder}: {error}") from None
     warnings.warn(
         f"the focal length was estimated as {focal_length:.0f} px from a person of {height:g} m; all lengths are as "
-        "right as that",
+        "right as that; calibrate the camera to know them",
         stacklevel=3,
     )
     camera = replace(camera, focal_length=focal_length)

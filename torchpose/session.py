@@ -48,7 +48,7 @@ SPACE = 60_000  # bytes that the parts and the files of a frame take, and some m
 _PARTS, _FILES = "parts", "files"  # folders of a run that is not finished
 _DRAWN = 50  # frames whose outlines are computed at once
 _SAME_RATE = 0.01  # relative
-_MOST_PROBLEMS = 5  # that are printed
+_MOST_PROBLEMS = 4  # that are printed
 
 
 class Session:

@@ -182,7 +182,8 @@ def _build(config_type: type, values: Mapping[str, Any], prefix: str = "") -> An
     try:
         return config_type(**arguments)
     except ValueError as error:
-        raise ValueError(f"{prefix}{error}") from None
+        remedy = "" if ";" in str(error) else "; correct it, --help-all says what it means"
+        raise ValueError(f"{prefix}{error}{remedy}") from None
 
 
 def _rows(config: Any, prefix: str) -> Iterator[tuple[str, str]]:

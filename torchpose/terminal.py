@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 _CODES = {"red": 31, "green": 32, "yellow": 33, "bold": 1}
 _LABEL = 18  # columns of a table's labels
+_MINUTES = 120.0  # s, from which a wait is told in minutes
 _EVERY = 15.0  # s between two lines of progress in a file
 
 
@@ -88,4 +89,5 @@ class Progress:
         if self.total is None:
             return f"frame {self.done}, {rate:.1f} a second, {words}"
         left = (self.total - self.done) / rate
-        return f"frame {self.done} of {self.total}, {rate:.1f} a second, {left / 60:.0f} min left, {words}"
+        wait = f"{left:.0f} s" if left < _MINUTES else f"{left / 60:.0f} min"
+        return f"frame {self.done} of {self.total}, {rate:.1f} a second, {wait} left, {words}"
