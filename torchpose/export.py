@@ -237,14 +237,34 @@ def _append_array(path: Path, name: str, shape: Sequence[int], pieces: Iterable[
             file.write(np.ascontiguousarray(piece.detach().to("cpu", torch.float64), "<f8").tobytes())
 
 
-def read_poses_npz(path: str | Path) -> PoseSequence:
-    """The sequence that `write_poses_npz` wrote."""
+def read_poses_npz(path: str | Path, covariance: bool = True) -> PoseSequence:
+    """The sequence that `write_poses_npz` wrote; without `pose_covariance`, three quarters of it, where not wanted."""
     fields: dict[str, Any] = {}
     with np.load(path) as arrays:
-        for name in set(arrays.files) - {"joint_names"}:
+        for name in set(arrays.files) - {"joint_names"} - (set() if covariance else {"pose_covariance"}):
             value = arrays[name]
             fields[name] = tuple(map(str, value)) if value.dtype.kind == "U" else torch.from_numpy(value)
     return PoseSequence(**fields)
+
+
+def read_pose_sd(path: str | Path) -> Float[Tensor, "time parameters"] | None:
+    """Standard deviations of the pose that `write_poses_npz` wrote, m and rad; None where it has no covariances.
+
+    The covariances are read a piece at a time, and never are in memory together.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if "pose_covariance.npy" not in archive.namelist():
+            return None
+        with archive.open("pose_covariance.npy") as file:
+            assert np.lib.format.read_magic(file) == (1, 0)
+            (length, size, _), _, dtype = np.lib.format.read_array_header_1_0(file)
+            found = torch.empty(length, size, dtype=torch.float64)
+            for start in range(0, length, _ROWS_AT_ONCE):
+                count = min(_ROWS_AT_ONCE, length - start)
+                rows = np.frombuffer(file.read(count * size * size * dtype.itemsize), dtype)
+                variance = torch.from_numpy(rows.reshape(count, size, size).copy()).diagonal(dim1=1, dim2=2)
+                found[start : start + count] = variance.clamp(min=0).sqrt()
+    return found
 
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:
