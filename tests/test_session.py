@@ -19,6 +19,7 @@ from torchpose.atomic import UnwritableFile
 from torchpose.cli import infer_main
 from torchpose.export import open_video
 from torchpose.recording import Backgrounds, write_recording
+from torchpose.registration.colour import ColourConfig
 from torchpose.registration.size import SizeConfig
 from torchpose.registration.start import StartConfig
 from torchpose.session import Session
@@ -31,8 +32,9 @@ CONFIG = tp.PoseConfig(
     height=1.75,
     size=SizeConfig(rounds=0),
     size_frames=1,
-    start=StartConfig(final_rounds=4),
+    start=StartConfig(points=150, rounds=4, final_rounds=4, finalists=2, refreshes=0),
     smoothing=SmoothingConfig(stretch=4, ahead=1),
+    colour=ColourConfig(strength=0.0),
 )
 QUICK = ["pose.height=1.75", "pose.size.rounds=0", "pose.size_frames=1", "pose.start.final_rounds=4"]
 QUICK += ["pose.smoothing.stretch=2", "pose.smoothing.ahead=1"]

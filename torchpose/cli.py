@@ -211,13 +211,17 @@ def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
     output, settings = Path(config.output), settings_of(config)
     activities = _activities(config)
+    camera = None if config.recording is None else camera_numbers(config.recording)
+    live = camera is not None and not config.record_first
+    pose = (
+        replace(config.pose, smoothing=config.live.smoothing(config.pose.smoothing)) if live else config.pose
+    )
 
     def session_of(recording: Recording, rows_before: float | None) -> Session:
-        model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
+        model = StereoToPose(recording.camera, config.eyes, pose).to(device)
         return Session(People(model, config.people), recording, output, settings, __version__, rows_before)
 
-    camera = None if config.recording is None else camera_numbers(config.recording)
-    if camera is not None and not config.record_first:
+    if camera is not None and live:
         summary = _follow_live(config, camera, output, session_of)
     else:
         recording, rows_before = _open(config, output)

@@ -165,7 +165,7 @@ class Recorder(threading.Thread):
         self.error: Exception | None = None
         self.missed, self.last_s = 0, 0.0  # numbers between those that came; the time of the last
         self._pairs = camera_pairs(devices, rate, clock)
-        self._max_frames = max_frames
+        self._rate, self._max_frames = rate, max_frames
         self._begins, self._begun, self._ends = threading.Event(), threading.Event(), threading.Event()
 
     def begin(self) -> None:
@@ -185,29 +185,28 @@ class Recorder(threading.Thread):
 
     def run(self) -> None:
         """What the thread does."""
-        first: Shot | None = None
+        first_s: float | None = None
         last = -1
         try:
             for number, time_s, pair in self._pairs:
                 if self._ends.is_set():
                     break
-                shot = Shot(number, time_s, pair)
-                if self._begins.is_set():
-                    if first is None:
-                        first = shot
-                        self.mailbox.clear()
-                        self._begun.set()
-                    shot = Shot(number - first.number, time_s - first.time_s, pair)
-                    self.missed, last, self.last_s = (
-                        self.missed + shot.number - last - 1,
-                        shot.number,
-                        shot.time_s,
-                    )
+                if not self._begins.is_set():
+                    self.mailbox.put(Shot(number, time_s, pair))
+                    continue
+                if first_s is None:
+                    first_s = time_s
+                    self.mailbox.clear()
+                    self._begun.set()
+                shot = Shot(round(self._rate * (time_s - first_s)), time_s - first_s, pair)
+                if shot.number <= last:  # the camera is faster than its calibration says
+                    continue
+                self.missed += shot.number - last - 1
+                last, self.last_s = shot.number, shot.time_s
                 self.mailbox.put(shot)
-                if first is not None:
-                    write_pair(self.folder, shot.number, pair)
-                    if self.mailbox.offered == self._max_frames:
-                        break
+                write_pair(self.folder, shot.number, pair)
+                if self.mailbox.offered == self._max_frames:
+                    break
         except Exception as error:  # a full disk, a device's own: the run ends with what there is
             self.error = error
         finally:

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,10 @@ from torchpose.recording import (
 )
 from torchpose.scaled import at_most
 from torchpose.session import Session
+from torchpose.tracking.smoother import SmoothingConfig
 from torchpose.web_view import WebView
 
+_GRAB = 15.0  # s that a camera may take to answer
 _RECENT = 20  # frames over which the rate is measured
 _SIDES = ("left", "right")
 _SHOWN = ("shoulder_flexion", "shoulder_abduction", "elbow_flexion", "hip_flexion", "knee_flexion")
@@ -56,6 +58,8 @@ class LiveConfig:
         8.0  # s to leave the view before the empty scene is recorded, where background= is not given
     )
     empty_frames: int = 20  # of the empty scene that are recorded then
+    stretch: int = 12  # at most so many frames are smoothed at once: nobody is followed meanwhile
+    ahead: int = 6  # coming frames that they hear of, at most
 
     def __post_init__(self) -> None:
         if not 0 <= self.port < 2**16:
@@ -65,6 +69,16 @@ class LiveConfig:
                 f"step_out must not be negative and empty_frames at least 1, got {self.step_out} and "
                 f"{self.empty_frames}; 8 and 20 are the defaults"
             )
+        if not 0 <= self.ahead < self.stretch:
+            raise ValueError(
+                f"0 <= ahead < stretch must hold, in frames, got {self.ahead} and {self.stretch}; 6 and 12 are the "
+                "defaults"
+            )
+
+    def smoothing(self, config: SmoothingConfig) -> SmoothingConfig:
+        """The smoothing of a live run: in shorter stretches."""
+        stretch = min(config.stretch, self.stretch)
+        return replace(config, stretch=stretch, ahead=min(config.ahead, self.ahead, stretch - 1))
 
 
 @dataclass
@@ -96,6 +110,7 @@ class LiveRun:
         live = LiveRecording(self.folder, known, recorder.mailbox)
         print(f"live on {view.url}; Ctrl-C, or the button on that page, ends it and writes the files")
         begin = time.perf_counter()
+        followed = 0
         recorder.start()
         try:
             with _ended_by_ctrl_c(recorder.end):
@@ -117,7 +132,10 @@ class LiveRun:
             return summary
         finally:
             recorder.end()
+            recorder.join(_GRAB)  # the cameras are closed after this
             view.close()
+            if not followed:
+                shutil.rmtree(self.folder, ignore_errors=True)
 
     def resume(self) -> dict[str, Any] | None:
         """Write the files of a run that ended before it had; None where there is none."""
@@ -132,7 +150,7 @@ class LiveRun:
         )
         session.recording = at_most(earlier, self.max_width)
         write_calibration(self.folder / CALIBRATION, known)
-        return session.finish(time.perf_counter(), len(earlier), {})
+        return session.finish(time.perf_counter(), len(earlier), {"rows_apart_px": None})
 
     def _prepare(
         self, live: LiveRecording, recorder: Recorder, view: WebView
