@@ -2,7 +2,7 @@
 
 python infer.py                            # a recording that the package makes itself
 python infer.py recording=DIR output=DIR   # yours
-python infer.py --help                     # every setting
+python infer.py --help                     # what there is to say and to set
 """
 
 import sys

@@ -2,7 +2,7 @@
 
 python train.py                   # on a database that the package makes itself
 python train.py experiment=NAME   # as configs/experiment/NAME.yaml says
-python train.py --help            # every setting
+python train.py --help            # what there is to say and to set
 """
 
 import sys

@@ -1,6 +1,7 @@
 """Settings: from YAML and the command line into frozen dataclasses, and every mistake by its message."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,8 +23,9 @@ from torchpose.cli import (
     load_config,
     run_command,
 )
+from torchpose.manual import FIRST
 from torchpose.recording import open_recording
-from torchpose.settings import compose_config, config_groups, describe
+from torchpose.settings import compose_config, config_groups, setting_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -165,8 +167,8 @@ def test_any_path_will_do(folder: Path, path: str):
             "fitting.steps.weights must be a list [...], each item a number, got 3; correct the value",
         ),
         ("fitting.steps.damping=0", "fitting.steps.damping must be positive, got 0.0; 0.001 is a good start"),
-        ("my_folder", "settings must be given as key=value, got 'my_folder'; --help lists them all"),
-        ("=3", "settings must be given as key=value, got '=3'; --help lists them all"),
+        ("my_folder", "settings must be given as key=value, got 'my_folder'; --help-all lists them"),
+        ("=3", "settings must be given as key=value, got '=3'; --help-all lists them"),
         ("fitting=typo", "unknown config key 'fitting.steps.weigths'; did you mean 'weights'?"),
         ("fitting=wrong", "fitting.em_steps must be a whole number, got 'many'; correct the value"),
     ],
@@ -183,19 +185,18 @@ def test_a_broken_file_is_told_in_one_line(folder: Path):
     assert "\n" not in str(error.value)
 
 
-def test_describe_gives_every_setting_its_comment():
-    lines = [line.split(maxsplit=1) for line in describe(Root()).splitlines()]
-    assert lines == [
-        ["recording=null", "a folder"],
-        ["output=runs"],
-        ["fitting.em_steps=5", "rounds a frame"],
-        ["fitting.robust=true"],
-        ["fitting.solver=SIMPLE"],
-        ["fitting.body=null", "above, in two lines"],
-        ["fitting.limit=2.5"],
-        ["fitting.steps.weights=[1.0,2.0]", "of each step"],
-        ["fitting.steps.names=[]"],
-        ["fitting.steps.damping=0.001"],
+def test_every_setting_has_its_comment():
+    assert setting_rows(Root()) == [
+        ("recording=null", "a folder"),
+        ("output=runs", ""),
+        ("fitting.em_steps=5", "rounds a frame"),
+        ("fitting.robust=true", ""),
+        ("fitting.solver=SIMPLE", ""),
+        ("fitting.body=null", "above, in two lines"),
+        ("fitting.limit=2.5", ""),
+        ("fitting.steps.weights=[1.0,2.0]", "of each step"),
+        ("fitting.steps.names=[]", ""),
+        ("fitting.steps.damping=0.001", ""),
     ]
 
 
@@ -213,12 +214,34 @@ def test_every_config_that_we_ship_is_valid(kind: Kind, overrides: list[str]):
 
 
 @pytest.mark.parametrize("kind", ["infer", "train"])
-def test_help_lists_every_setting_with_its_meaning(kind: Kind):
+def test_help_says_what_is_needed_on_a_screen_or_two(kind: Kind):
     text = help_text(kind)
     assert f"usage: python {kind}.py" in text
-    for field in dataclasses.fields(CONFIG_TYPES[kind]):
-        assert f"\n  {field.name}" in text
-    assert "start over instead of continuing" in text
+    assert text.count(f"\n  python {kind}.py") == 3
+    assert len(text.splitlines()) <= 50
+    assert max(map(len, text.splitlines())) <= 100
+    assert "start over instead of continuing" in " ".join(text.split())
+    for name in FIRST[kind]:
+        assert f"\n  {name}=" in text, name
+
+
+@pytest.mark.parametrize("kind", ["infer", "train"])
+def test_the_whole_help_has_every_setting_once_under_a_heading(kind: Kind):
+    text = help_text(kind, whole=True)
+    assert max(map(len, text.splitlines())) <= 100
+    joined = text.replace("=\n    ", "=").splitlines()  # a long list goes below its name
+    for setting, _ in setting_rows(load_config(kind)):
+        assert sum(setting in line.split() for line in joined) == 1, setting
+    assert "\npose.registration:" in text
+    assert "\neyes.stereo:" in text
+
+
+@pytest.mark.parametrize("kind", ["infer", "train"])
+def test_the_commands_in_the_help_are_real(kind: Kind):
+    for line in help_text(kind).splitlines():
+        if line.startswith(f"  python {kind}.py"):
+            words = re.split(r"\s{2,}", line.strip())[0].split()[2:]
+            load_config(kind, words)
 
 
 @pytest.mark.parametrize(
@@ -279,7 +302,7 @@ def interrupt(config: object, device: object) -> None:
             2,
             "error: the recording must be a folder or a video, but /no such folder does not exist",
         ),
-        ([], fail_on_disk, 2, "error: /proc/no: "),
+        ([], fail_on_disk, 2, "error: /proc/no/such/file.csv must be written, got: "),
         ([], interrupt, 130, "\ninterrupted: the same command again goes on where this one stopped\n"),
     ],
 )

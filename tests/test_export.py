@@ -21,6 +21,7 @@ from torchpose.export import (
     PoseSequence,
     open_video,
     pose_columns,
+    read_pose_sd,
     read_poses_csv,
     read_poses_npz,
     write_poses_csv,
@@ -295,4 +296,40 @@ def test_a_run_without_a_pose_has_no_misfit_to_tell() -> None:
         "point_to_model_m": {"mean": math.nan},
     }
     rest = {"seconds": 1.0, "seconds_per_frame": 0.5, "cpu_ms_per_frame": {}, "problems": [], "others": []}
-    assert "point to model    -\n" in summary_table(summary | rest, Path("out"))
+    rest |= {"files": ["poses.csv"]}
+    assert "point to model    -\n" in summary_table(summary | rest, Path("out"), 80)
+
+
+def test_covariances_may_come_in_pieces_and_be_read_as_deviations(tmp_path: Path) -> None:
+    """One file whether they are in memory together or not; the deviations are the roots of the diagonal."""
+    T, P = 2500, 4
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(T, P, P, generator=generator, dtype=torch.float64)
+    covariance, empty = root @ root.mT, torch.zeros(T, 1, dtype=torch.float64)
+    whole = PoseSequence(
+        frame=torch.arange(T),
+        time_s=torch.arange(T, dtype=torch.float64),
+        status=("tracked", "absent") * (T // 2),
+        point_to_model=empty[:, 0],
+        joints=torch.randn(T, 15, 3, generator=generator, dtype=torch.float64),
+        angle_names=("knee",),
+        angles=empty,
+        angle_sd=empty,
+        limb_angle_names=("elbow",),
+        limb_angles=empty,
+        pose=root[:, 0],
+        pose_covariance=covariance,
+    )
+    write_poses_npz(tmp_path / "whole.npz", whole)
+    clean = whole.without_stale_numbers().pose_covariance
+    pieces = iter(clean.split([1, 1499, 1000]))
+    write_poses_npz(tmp_path / "pieces.npz", dataclasses.replace(whole, pose_covariance=None), pieces)
+    with np.load(tmp_path / "whole.npz") as one, np.load(tmp_path / "pieces.npz") as other:
+        assert set(one.files) == set(other.files)
+        for name in one.files:
+            np.testing.assert_array_equal(one[name], other[name])
+    sd = read_pose_sd(tmp_path / "pieces.npz")
+    torch.testing.assert_close(sd, clean.diagonal(dim1=1, dim2=2).sqrt(), equal_nan=True)
+    assert read_poses_npz(tmp_path / "whole.npz", covariance=False).pose_covariance is None
+    write_poses_npz(tmp_path / "none.npz", dataclasses.replace(whole, pose_covariance=None))
+    assert read_pose_sd(tmp_path / "none.npz") is None

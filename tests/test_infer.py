@@ -153,11 +153,11 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
 def test_other_settings_start_over(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     model = tp.People(tp.StereoToPose(tp.open_recording(folder).camera))
     run = session.Session(model, tp.open_recording(folder), tmp_path, {"a": 1}, "1")
-    assert run._resume(fresh=False) == 0
-    (run.parts / "poses_00000002.npz").write_bytes(b"")
+    assert run.begin(fresh=False) == 0
+    (run.parts.folder / "poses_00000002.npz").write_bytes(b"")
     other = session.Session(model, tp.open_recording(folder), tmp_path, {"a": 2}, "1")
-    assert other._resume(fresh=False) == 0
-    assert not list(run.parts.glob("poses_*"))
+    assert other.begin(fresh=False) == 0
+    assert other.parts.ends == []
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("registration/*.yaml")), ids=lambda path: path.stem)
@@ -239,7 +239,14 @@ def test_a_live_camera_is_recorded_and_then_run(
     for side in ("left", "right"):
         (tmp_path / "rig" / side / "000000.png").rename(tmp_path / "empty" / f"{side}_0.png")
     rig = [f"calibration={tmp_path / 'rig' / 'calibration.yaml'}", f"background={tmp_path / 'empty'}"]
-    command = ["recording=camera:0", *rig, f"output={tmp_path / 'out'}", "max_frames=2", *QUICK]
+    command = [
+        "recording=camera:0",
+        "record_first=true",
+        *rig,
+        f"output={tmp_path / 'out'}",
+        "max_frames=2",
+        *QUICK,
+    ]
     opened = []
     monkeypatch.setattr(
         cli, "open_cameras", lambda numbers: opened.append(numbers) or [cv2.VideoCapture(str(path))]
@@ -288,8 +295,11 @@ def test_a_live_camera_needs_its_settings_and_a_device(tmp_path: Path, capsys: p
     ]
     for command, message in (
         (camera, "camera:87 must be a camera of this machine, got none that can be opened; plug it in"),
-        (camera[:2], "max_frames must be given for a live camera, got null; add max_frames="),
-        (camera[::2], "calibration must be given for a live camera, got null; add calibration="),
+        (
+            [*camera[:2], "record_first=true"],
+            "max_frames must be given for a camera, got null; add max_frames=",
+        ),
+        (camera[::2], "calibration must be given for a camera, got null; add calibration="),
         ([*camera, "right=b.mp4"], "right must be a video beside a left one, got b.mp4 beside a camera"),
         (
             ["recording=camera:1+1"],

@@ -12,7 +12,16 @@ PACKAGE = Path(__file__).resolve().parents[1] / "torchpose"
 # may import one another, also those that the design names and that are still to come. A new file takes its
 # place here first.
 ROOMS: dict[str, tuple[str, ...]] = {
-    "the ground": ("version", "atomic", "image_file", "settings", "geometry", "least_squares"),
+    "the ground": (
+        "version",
+        "atomic",
+        "terminal",
+        "image_file",
+        "settings",
+        "manual",
+        "geometry",
+        "least_squares",
+    ),
     "vision": (
         "camera",
         "windows",
@@ -69,7 +78,20 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
         *("export", "figures", "timeline", "journal", "activities"),
-        *("eyes", "pipeline", "window", "people", "session", "clips", "study", "cli"),
+        *(
+            "eyes",
+            "pipeline",
+            "window",
+            "people",
+            "parts",
+            "overlay",
+            "session",
+            "web_view",
+            "live",
+            "clips",
+            "study",
+            "cli",
+        ),
     ),
 }
 ORDER = [

@@ -5,6 +5,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.activity.codebook import Codebook
@@ -12,7 +13,7 @@ from torchpose.activity.dataset import Clip
 from torchpose.activity.diary import Diary, DiaryConfig, Entry
 from torchpose.activity.recognizer import Recognizer
 from torchpose.body.model import BodyModel
-from torchpose.export import JOINT_NAMES, PoseSequence, read_poses_npz
+from torchpose.export import JOINT_NAMES, PoseSequence, read_pose_sd, read_poses_npz
 from torchpose.journal import Journal, write_activities_csv
 
 Diaries = dict[str, list[Entry]]
@@ -65,8 +66,9 @@ class ActivityWriter:
         found: Diaries = {}
         for path in sorted(output.glob("poses*.npz")):
             mark = path.stem.removeprefix("poses")
-            sequence = read_poses_npz(path)
-            entries = self.diary.write(self.clip(sequence, body), sequence.time_s)
+            sequence = read_poses_npz(path, covariance=False)
+            clip = self.clip(sequence, body, read_pose_sd(path))
+            entries = self.diary.write(clip, sequence.time_s)
             write_activities_csv(output / f"activities{mark}.csv", entries)
             found[self.person + mark] = entries
         if self.journal is not None:
@@ -75,15 +77,23 @@ class ActivityWriter:
                 self.journal.add(person, recording, self.started, entries)
         return found
 
-    def clip(self, sequence: PoseSequence, body: BodyModel) -> Clip:
-        """The poses as the recogniser's features take them; a frame without a pose is NaN."""
+    def clip(
+        self,
+        sequence: PoseSequence,
+        body: BodyModel,
+        pose_sd: Float[Tensor, "time parameters"] | None = None,
+    ) -> Clip:
+        """The poses as the recogniser's features take them; a frame without a pose is NaN.
+
+        `pose_sd` are the standard deviations of a sequence without covariances, m and rad.
+        """
         clean = sequence.without_stale_numbers()
         if clean.pose is None:
             raise ValueError(
                 "activities need the body model's own pose, got a sequence without it; read poses.npz"
             )
         pose, like = clean.pose, body.default_size(1)
-        sd = torch.full_like(pose, torch.nan)
+        sd = torch.full_like(pose, torch.nan) if pose_sd is None else pose_sd
         if clean.pose_covariance is not None:
             sd = clean.pose_covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
         seen = pose.isfinite().all(1)

@@ -14,9 +14,10 @@ from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from torchpose.calibration import Calibration, read_calibration, write_calibration
-from torchpose.image_file import encode
+from torchpose.image_file import decode, encode
 from torchpose.recording import BACKGROUND, CALIBRATION
 
 _PREFIX = "camera:"
@@ -111,18 +112,13 @@ def capture_recording(
     its size, or no image comes.
     """
     folder = Path(folder)
-    if folder.exists() and any(folder.iterdir()):
-        raise ValueError(
-            f"the folder of a new recording must be empty, got {folder} with an earlier one; recording={folder} runs "
-            "that, and fresh=true or another output records anew"
-        )
-    known = _prepare(devices, Path(calibration))
+    require_empty(folder)
+    known = prepare_cameras(devices, Path(calibration))
     rate = known.camera.frame_rate
     number, last, frames, interrupted = 0, -1, 0, False
     try:
-        for number, pair in _pairs(devices, rate, clock):
-            for side, image in zip(_SIDES, pair, strict=True):
-                encode(_path(folder, side, number), image)
+        for number, _, pair in camera_pairs(devices, rate, clock):
+            write_pair(folder, number, pair)
             last, frames = number, frames + 1
             if frames == max_frames:
                 break
@@ -143,7 +139,7 @@ def capture_recording(
     return Capture(folder, frames, last + 1 - frames, last / rate, interrupted)
 
 
-def _prepare(devices: Sequence[CaptureDevice], path: Path) -> Calibration:
+def prepare_cameras(devices: Sequence[CaptureDevice], path: Path) -> Calibration:
     """The calibration, and the devices set to its size and frame rate; ValueError where they cannot be."""
     promised = devices[0].get(cv2.CAP_PROP_FPS)
     promised_rate = promised if promised > 0 else None  # DepthAI's calibrations have none
@@ -172,10 +168,10 @@ def _prepare(devices: Sequence[CaptureDevice], path: Path) -> Calibration:
     return calibration
 
 
-def _pairs(
+def camera_pairs(
     devices: Sequence[CaptureDevice], rate: float, clock: Callable[[], float]
-) -> Iterator[tuple[int, Sequence[np.ndarray]]]:
-    """Number, and left and right image as OpenCV orders them, of each pair that comes, until none does."""
+) -> Iterator[tuple[int, float, Sequence[np.ndarray]]]:
+    """Number, time since the first, s, and left and right image, as OpenCV orders them, of each pair."""
     begin = started = 0.0
     last, failures = -1, 0
     while failures < _FAILURES:
@@ -186,7 +182,8 @@ def _pairs(
         stamp, now = devices[0].get(cv2.CAP_PROP_POS_MSEC) / 1000, clock()
         if last < 0:
             begin, started = stamp, now
-        number = round(rate * (stamp - begin if stamp > begin else now - started))
+        time_s = stamp - begin if stamp > begin else now - started
+        number = round(rate * time_s)
         if number <= last:  # the camera is faster than its calibration says
             continue
         there, images = zip(*(device.retrieve() for device in devices), strict=True)
@@ -194,7 +191,27 @@ def _pairs(
             failures += 1
             continue
         last, failures = number, 0
-        yield number, np.split(images[0], 2, axis=1) if len(images) == 1 else images
+        yield number, time_s, np.split(images[0], 2, axis=1) if len(images) == 1 else images
+
+
+def write_pair(folder: Path, number: int, pair: Sequence[np.ndarray]) -> None:
+    """Write left and right image, as OpenCV orders them, into a recording's folder."""
+    for side, image in zip(_SIDES, pair, strict=True):
+        encode(_path(folder, side, number), image)
+
+
+def read_pair(folder: Path, number: int) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """Left and right image, as OpenCV orders them; ValueError where one cannot be read."""
+    return [decode(_path(folder, side, number), cv2.IMREAD_COLOR) for side in _SIDES]
+
+
+def require_empty(folder: Path) -> None:
+    """Raise ValueError where there is something in the folder of a new recording."""
+    if folder.exists() and any(folder.iterdir()):
+        raise ValueError(
+            f"the folder of a new recording must be empty, got {folder} with an earlier one; recording={folder} runs "
+            "that, and fresh=true or another output records anew"
+        )
 
 
 def _path(folder: Path, side: str, number: int) -> Path:

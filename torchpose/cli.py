@@ -1,12 +1,14 @@
 """The command line: settings as `key=value`, checked before anything runs, and errors of one sentence."""
 
-import inspect
 import math
 import shutil
+import signal
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -20,16 +22,20 @@ from torchpose.activity.diary import DiaryConfig
 from torchpose.activity.features import FeatureKind
 from torchpose.activity.recognizer import RecognizerConfig
 from torchpose.aligned import AlignedRecording, align_recording
+from torchpose.atomic import require_writable
+from torchpose.body.model import BodyModel
 from torchpose.capture import camera_numbers, capture_recording, open_cameras
 from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.eyes import EyesConfig
+from torchpose.live import LiveConfig, LiveRun
+from torchpose.manual import full_help, short_help
 from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
 from torchpose.scaled import at_most
 from torchpose.session import Session, is_interrupted, settings_of, summary_table
-from torchpose.settings import compose_config, config_groups, describe
+from torchpose.settings import compose_config, config_groups
 from torchpose.study import (
     THESIS_ACCURACY,
     count_material,
@@ -38,6 +44,7 @@ from torchpose.study import (
     study_table,
     write_study,
 )
+from torchpose.terminal import coloured, width
 from torchpose.version import __version__
 
 PACKAGE = Path(__file__).resolve().parent
@@ -60,7 +67,10 @@ class InferConfig:
     calibration: str | None = None  # its file, instead of the folder's own; a video or a camera needs one
     background: str | None = None  # folder with images of the empty scene, instead of the folder's own
     output: str = "runs/infer"  # folder for the results
-    max_frames: int | None = None  # take only the first so many frames; a camera needs it
+    max_frames: int | None = None  # take only the first so many frames; record_first needs it
+    record_first: bool = (
+        False  # a camera is recorded, max_frames of it, and then run, instead of followed live
+    )
     max_width: int = 800  # px; wider images are shrunk as they are read, and are matched much faster
     align: bool = True  # move the right images' rows onto the left's where they are more than 0.25 px apart
     fresh: bool = False  # start over instead of continuing an interrupted run
@@ -70,6 +80,7 @@ class InferConfig:
     eyes: EyesConfig = field(default_factory=EyesConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     people: PeopleConfig = field(default_factory=PeopleConfig)
+    live: LiveConfig = field(default_factory=LiveConfig)
     recognizer: str | None = (
         None  # folder of a trained one, runs/train/recognizers/angles: writes activities.csv
     )
@@ -85,9 +96,9 @@ class InferConfig:
         if self.recording is None and given:
             raise ValueError(f"{given[0]} must come with a recording, got none; give recording=PATH as well")
         if self.recording is not None and camera_numbers(self.recording) is not None:
-            for name in ("calibration", "max_frames"):
+            for name in ("calibration", "max_frames") if self.record_first else ("calibration",):
                 if getattr(self, name) is None:
-                    raise ValueError(f"{name} must be given for a live camera, got null; add {name}=")
+                    raise ValueError(f"{name} must be given for a camera, got null; add {name}=")
             if self.right is not None:
                 raise ValueError(
                     f"right must be a video beside a left one, got {self.right} beside a camera; leave it out"
@@ -179,18 +190,11 @@ def load_config(kind: Kind, overrides: Sequence[str] = ()) -> InferConfig | Trai
     return compose_config(CONFIG_TYPES[kind], CONFIGS, kind, overrides)
 
 
-def help_text(kind: Kind) -> str:
-    """What `--help` prints: purpose, usage, and every setting with its default and its meaning."""
-    groups = config_groups(CONFIGS, kind)
-    parts = [
-        inspect.getdoc(CONFIG_TYPES[kind]),
-        f"usage: python {kind}.py [key=value ...]",
-        f"settings, with their defaults:\n{describe(load_config(kind))}",
-    ]
-    if groups:
-        sets = "\n".join(f"  {group}=NAME, one of {', '.join(names)}" for group, names in groups.items())
-        parts.append(f"sets of settings, from configs/:\n{sets}")
-    return "\n\n".join(map(str, parts)) + "\n"
+def help_text(kind: Kind, whole: bool = False) -> str:
+    """What `--help` prints, or `--help-all` for the `whole`, see `torchpose.manual`."""
+    config = load_config(kind)
+    text = full_help(kind, config, config_groups(CONFIGS, kind)) if whole else short_help(kind, config)
+    return f"{text}\n"
 
 
 def infer_main(argv: Sequence[str]) -> int:
@@ -207,6 +211,28 @@ def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
     output, settings = Path(config.output), settings_of(config)
     activities = _activities(config)
+    camera = None if config.recording is None else camera_numbers(config.recording)
+    live = camera is not None and not config.record_first
+    pose = (
+        replace(config.pose, smoothing=config.live.smoothing(config.pose.smoothing)) if live else config.pose
+    )
+
+    def session_of(recording: Recording, rows_before: float | None) -> Session:
+        model = StereoToPose(recording.camera, config.eyes, pose).to(device)
+        return Session(People(model, config.people), recording, output, settings, __version__, rows_before)
+
+    if camera is not None and live:
+        summary = _follow_live(config, camera, output, session_of)
+    else:
+        recording, rows_before = _open(config, output)
+        summary = session_of(recording, rows_before).run(config.fresh, config.max_frames)
+    print(summary_table(summary, output, width()))
+    if activities is not None:
+        print(activity_lines(activities.write(output, BodyModel(config.pose.body), str(output.resolve()))))
+
+
+def _open(config: InferConfig, output: Path) -> tuple[Recording, float | None]:
+    """The recording with its rows corrected and its images shrunk, and how far apart its rows were, px."""
     if config.recording is None:
         print("no recording given: making one (recording=DIR runs yours)")
         recording: Recording = demo_recording(config.seed)
@@ -214,18 +240,48 @@ def infer(config: InferConfig, device: torch.device) -> None:
         config = _captured(config, output)
         assert config.recording is not None
         recording = open_recording(config.recording, config.right, config.calibration, config.background)
+    require_writable(output)
     rows_before = None
     if config.align:
         recording = align_recording(recording)
         if isinstance(recording, AlignedRecording):
             shrunk = min(1.0, config.max_width / recording.camera.width)
             rows_before = recording.alignment.typical * shrunk
-    recording = at_most(recording, config.max_width)
-    model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    session = Session(People(model, config.people), recording, output, settings, __version__, rows_before)
-    print(summary_table(session.run(config.fresh, config.max_frames), output))
-    if activities is not None:
-        print(activity_lines(activities.write(output, model.body, str(output.resolve()))))
+    return at_most(recording, config.max_width), rows_before
+
+
+def _follow_live(
+    config: InferConfig,
+    camera: tuple[int, ...],
+    output: Path,
+    session_of: Callable[[Recording, float | None], Session],
+) -> dict[str, Any]:
+    """The summary of a camera that is followed live, or of the files of one that was before they could be written."""
+    assert config.calibration is not None
+    folder, interrupted = output / "recording", is_interrupted(output, settings_of(config), __version__)
+    live = LiveRun(
+        folder,
+        Path(config.calibration),
+        config.live,
+        session_of,
+        config.max_width,
+        config.align,
+        config.background,
+        config.max_frames,
+    )
+    if interrupted and folder.is_dir() and not config.fresh:
+        summary = live.resume()
+        if summary is not None:
+            return summary
+    devices = open_cameras(camera)
+    try:
+        require_writable(output)
+        if config.fresh:
+            shutil.rmtree(folder, ignore_errors=True)
+        return live.run(devices)
+    finally:
+        for device in devices:
+            device.release()
 
 
 def _activities(config: InferConfig) -> ActivityWriter | None:
@@ -268,6 +324,7 @@ def _captured(config: InferConfig, output: Path) -> InferConfig:
 def train(config: TrainConfig, device: torch.device) -> None:
     """Train and score the activity recogniser, and write and print the results."""
     begin = time.perf_counter()
+    require_writable(Path(config.output))
     clips, folds, notes = _material(config, device)
     prepared = time.perf_counter() - begin
     scores = run_study(clips, folds, config.features, replace(config.recognizer, seed=config.seed))
@@ -311,32 +368,49 @@ def _material(
 def run_command(kind: Kind, argv: Sequence[str], action: Callable[[Any, torch.device], None]) -> int:
     """Run `action` with the configuration that `argv` describes, and its device; returns the exit code.
 
-    0: done. 2: the input is at fault, and a sentence on stderr says how. 130: interrupted. An error that the
-    package did not raise itself is a fault of ours, and goes on with its traceback.
+    0: done. 2: the input is at fault, and a sentence on stderr says how. 130: interrupted, by Ctrl-C or by SIGTERM. An
+    error that the package did not raise itself is a fault of ours, and goes on with its traceback. `--fresh` is
+    `fresh=true`.
     """
     try:
-        if {"-h", "--help"} & set(argv):
-            print(help_text(kind), end="")
+        if {"-h", "--help", "--help-all"} & set(argv):
+            print(help_text(kind, "--help-all" in argv), end="")
             return 0
-        config = load_config(kind, argv)
+        config = load_config(kind, ["fresh=true" if word == "--fresh" else word for word in argv])
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
-        with warnings.catch_warnings():
-            warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
+        with warnings.catch_warnings(), _interruptible():
+            warnings.showwarning = lambda message, *_, **__: _say("warning", "yellow", message)
             action(config, find_device(config.device))
     except KeyboardInterrupt:
         print("\ninterrupted: the same command again goes on where this one stopped", file=sys.stderr)
         return INTERRUPTED
     except OSError as error:
-        reason = f"{error.filename}: {error.strerror}" if error.filename else error
-        print(f"error: {reason}", file=sys.stderr)
+        _say("error", "red", f"{error.filename}: {error.strerror}" if error.filename else error)
         return BAD_INPUT
     except ValueError as error:
         if not _raised_by_the_package(error):
             raise
-        print(f"error: {error}", file=sys.stderr)
+        _say("error", "red", error)
         return BAD_INPUT
     return 0
+
+
+def _say(kind: str, colour: str, message: object) -> None:
+    print(f"{coloured(f'{kind}:', colour, sys.stderr)} {message}", file=sys.stderr)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM, as sent by batch systems and at shutdown, is taken like Ctrl-C, so that nothing half written stays."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def find_device(name: str) -> torch.device:

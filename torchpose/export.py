@@ -6,9 +6,13 @@ and in degrees in the table. Left and right are the subject's.
 
 import csv
 import dataclasses
+import errno
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import shutil
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -34,6 +38,9 @@ JOINT_NAMES = (
     *(f"{joint}_{side}" for joint in ("hip", "knee", "ankle") for side in ("left", "right")),
 )
 _FIRST_COLUMNS = ("frame", "time_s", "status", "point_to_model_m")
+_ROWS_AT_ONCE = 1024  # of a table, in memory as text or as copies
+_LOOK = 50  # frames, after which it is seen whether the disk is full
+_FULL_DISK = 2**20  # bytes; with fewer left a disk is taken to be full
 _VIDEO_CODECS = ("mp4v", "avc1")  # OpenCV's own wheels have the first
 
 
@@ -75,6 +82,13 @@ class PoseSequence:
 
     def __len__(self) -> int:
         return len(self.status)
+
+    def __getitem__(self, frames: slice, /) -> "PoseSequence":
+        """Some of the frames."""
+        names = ("angle_names", "limb_angle_names")
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        cut = {n: value if n in names or value is None else value[frames] for n, value in fields.items()}
+        return PoseSequence(**cut)
 
     @property
     def answered(self) -> tuple[bool, ...]:
@@ -132,24 +146,27 @@ def pose_columns(angle_names: Sequence[str], limb_angle_names: Sequence[str]) ->
 
 def write_poses_csv(path: Path, sequence: PoseSequence) -> None:
     """Write `poses.csv`: a row a frame, to micrometres and 1e-4 degrees; cells without a number are empty."""
-    clean = sequence.without_stale_numbers()
+    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(pose_columns(sequence.angle_names, sequence.limb_angle_names))
+        for start in range(0, len(sequence), _ROWS_AT_ONCE):
+            writer.writerows(_table_rows(sequence[start : start + _ROWS_AT_ONCE].without_stale_numbers()))
+
+
+def _table_rows(clean: PoseSequence) -> Iterator[list[str | int]]:
+    """The rows of `poses.csv`."""
     degrees = torch.stack([clean.angles, clean.angle_sd], dim=-1).flatten(1)
     columns = {
         ".6f": torch.cat([clean.point_to_model[:, None], clean.joints.flatten(1)], dim=1),
         ".4f": torch.cat([degrees, clean.limb_angles], dim=1).rad2deg(),
     }
-    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(pose_columns(clean.angle_names, clean.limb_angle_names))
-        for row, status in enumerate(clean.status):
-            numbers = [
-                format(number, spec) if math.isfinite(number) else ""
-                for spec, values in columns.items()
-                for number in values[row].tolist()
-            ]
-            writer.writerow(
-                [int(clean.frame[row]), format(clean.time_s[row].item(), ".6f"), status, *numbers]
-            )
+    for row, status in enumerate(clean.status):
+        numbers = [
+            format(number, spec) if math.isfinite(number) else ""
+            for spec, values in columns.items()
+            for number in values[row].tolist()
+        ]
+        yield [int(clean.frame[row]), format(clean.time_s[row].item(), ".6f"), status, *numbers]
 
 
 def read_poses_csv(path: str | Path) -> PoseSequence:
@@ -187,23 +204,67 @@ def read_poses_csv(path: str | Path) -> PoseSequence:
     )
 
 
-def write_poses_npz(path: Path, sequence: PoseSequence) -> None:
-    """Write everything in full precision: an array for each field of `PoseSequence`, and `joint_names`."""
-    clean = sequence.without_stale_numbers()
-    fields = {field.name: getattr(clean, field.name) for field in dataclasses.fields(clean)}
-    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in fields.items() if value is not None}
+def write_poses_npz(
+    path: Path,
+    sequence: PoseSequence,
+    covariances: Iterable[Float[Tensor, "some parameters parameters"]] | None = None,
+) -> None:
+    """Write everything in full precision: an array for each field of `PoseSequence`, and `joint_names`.
+
+    `covariances` are those of all frames in pieces, for a sequence without: of a long one they need not be in memory
+    together.
+    """
+    chunks = [slice(start, start + _ROWS_AT_ONCE) for start in range(0, len(sequence), _ROWS_AT_ONCE)]
+    fields = {field.name: getattr(sequence, field.name) for field in dataclasses.fields(sequence)}
+    numbers = {n for n, value in fields.items() if isinstance(value, Tensor) and value.is_floating_point()}
+    others = {n: np.asarray(v) for n, v in fields.items() if v is not None and n not in numbers}
     with replacing(path) as partial:
-        np.savez(partial, joint_names=np.asarray(JOINT_NAMES), **arrays)
+        np.savez(partial, allow_pickle=False, joint_names=np.asarray(JOINT_NAMES), **others)
+        for name in sorted(numbers):
+            rows = (getattr(sequence[chunk].without_stale_numbers(), name) for chunk in chunks)
+            _append_array(partial, name, fields[name].shape, rows)
+        if covariances is not None and sequence.pose is not None:
+            parameters = sequence.pose.shape[1]
+            _append_array(partial, "pose_covariance", (len(sequence), parameters, parameters), covariances)
 
 
-def read_poses_npz(path: str | Path) -> PoseSequence:
-    """The sequence that `write_poses_npz` wrote."""
+def _append_array(path: Path, name: str, shape: Sequence[int], pieces: Iterable[Tensor]) -> None:
+    """Add to an `.npz` an array of float64 that comes in pieces along its first axis."""
+    with zipfile.ZipFile(path, "a") as archive, archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+        header = {"descr": "<f8", "fortran_order": False, "shape": tuple(shape)}
+        np.lib.format.write_array_header_1_0(file, header)
+        for piece in pieces:
+            file.write(np.ascontiguousarray(piece.detach().to("cpu", torch.float64), "<f8").tobytes())
+
+
+def read_poses_npz(path: str | Path, covariance: bool = True) -> PoseSequence:
+    """The sequence that `write_poses_npz` wrote; without `pose_covariance`, three quarters of it, where not wanted."""
     fields: dict[str, Any] = {}
     with np.load(path) as arrays:
-        for name in set(arrays.files) - {"joint_names"}:
+        for name in set(arrays.files) - {"joint_names"} - (set() if covariance else {"pose_covariance"}):
             value = arrays[name]
             fields[name] = tuple(map(str, value)) if value.dtype.kind == "U" else torch.from_numpy(value)
     return PoseSequence(**fields)
+
+
+def read_pose_sd(path: str | Path) -> Float[Tensor, "time parameters"] | None:
+    """Standard deviations of the pose that `write_poses_npz` wrote, m and rad; None where it has no covariances.
+
+    The covariances are read a piece at a time, and never are in memory together.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if "pose_covariance.npy" not in archive.namelist():
+            return None
+        with archive.open("pose_covariance.npy") as file:
+            assert np.lib.format.read_magic(file) == (1, 0)
+            (length, size, _), _, dtype = np.lib.format.read_array_header_1_0(file)
+            found = torch.empty(length, size, dtype=torch.float64)
+            for start in range(0, length, _ROWS_AT_ONCE):
+                count = min(_ROWS_AT_ONCE, length - start)
+                rows = np.frombuffer(file.read(count * size * size * dtype.itemsize), dtype)
+                variance = torch.from_numpy(rows.reshape(count, size, size).copy()).diagonal(dim1=1, dim2=2)
+                found[start : start + count] = variance.clamp(min=0).sqrt()
+    return found
 
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:
@@ -217,14 +278,14 @@ class VideoWriter:
     """Appends images to a video, see `open_video`."""
 
     def __init__(self, path: Path, width: int, height: int, frame_rate: float) -> None:
-        self.width, self.height = width, height
+        self.path, self.width, self.height, self.frames = path, width, height, 0
         self._padding = (0, width % 2, 0, height % 2)  # codecs want even sizes
         size = (width + width % 2, height + height % 2)
         for codec in _VIDEO_CODECS:
             self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), frame_rate, size)
             if self._writer.isOpened():
                 return
-        raise OSError(0, f"OpenCV has no encoder for {' or '.join(_VIDEO_CODECS)} here", str(path))
+        raise _lost(path)
 
     def write(self, image: Float[Tensor, "3 height width"]) -> None:
         """Append an RGB image in [0, 1] of the video's size."""
@@ -236,6 +297,9 @@ class VideoWriter:
         image = F.pad(image.detach().cpu()[None], self._padding, mode="replicate")[0]
         levels = image.clamp(0, 1).mul(255).round().byte()
         self._writer.write(np.ascontiguousarray(levels.permute(1, 2, 0).numpy()[..., ::-1]))
+        self.frames += 1
+        if self.frames % _LOOK == 0 and shutil.disk_usage(self.path.parent).free < _FULL_DISK:
+            raise _lost(self.path)
 
     def close(self) -> None:
         """Finish the file."""
@@ -244,13 +308,38 @@ class VideoWriter:
 
 @contextmanager
 def open_video(path: Path, width: int, height: int, frame_rate: float) -> Iterator[VideoWriter]:
-    """A writer for an MP4 file at `path`, which is there when the block ends without error."""
+    """A writer for an MP4 file at `path`, which is there when the block ends without error.
+
+    Raises UnwritableFile where the file does not hold all that was written, as on a full disk.
+    """
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # one sentence is enough
     with replacing(path) as partial:
-        video = VideoWriter(partial, width, height, frame_rate)
         try:
-            yield video
+            video = VideoWriter(partial, width, height, frame_rate)
+            try:
+                yield video
+            finally:
+                video.close()
         finally:
-            video.close()
+            cv2.utils.logging.setLogLevel(level)
+        if not _holds(partial, video.frames):  # OpenCV does not tell
+            raise _lost(partial)
+
+
+def _lost(path: Path) -> OSError:
+    """Why a video could not be written."""
+    if shutil.disk_usage(path.parent).free < _FULL_DISK:
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    return OSError(errno.EIO, f"OpenCV wrote no whole video by {' or '.join(_VIDEO_CODECS)}", str(path))
+
+
+def _holds(path: Path, frames: int) -> bool:
+    """Whether a video has so many frames, and the last one can be read."""
+    video = cv2.VideoCapture(str(path))
+    if frames == 0 or int(video.get(cv2.CAP_PROP_FRAME_COUNT)) != frames:
+        return frames == 0
+    video.set(cv2.CAP_PROP_POS_FRAMES, frames - 1)
+    return bool(video.read()[0])
 
 
 def _jsonable(value: Any) -> Any:

@@ -67,6 +67,7 @@ _SIGNS = {
 _WORST_SD = np.pi / 4  # rad; an angle that is less certain says nothing, and its band would fill the panel
 _NO_POSE: dict[str, Any] = {"facecolor": "0.92", "edgecolor": "0.75", "hatch": "////", "linewidth": 0}
 _PANEL_COLUMNS = 3
+_MOST_DRAWN = 4000  # frames of a plot whose panels are 400 px wide; of more, each second, third and so on
 _LEAST_SPAN = 20.0  # degrees from the bottom to the top of a panel, so that noise looks like noise
 _SHIFT = 4  # bits behind the point in OpenCV's coordinates
 _FAR = 1e5  # px; beyond it OpenCV's coordinates would overflow
@@ -109,7 +110,7 @@ def plot_angles(path: Path, sequence: PoseSequence) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    clean = sequence.without_stale_numbers()
+    clean = sequence[:: max(1, len(sequence) // _MOST_DRAWN)].without_stale_numbers()
     panels = _panels(clean.angle_names)
     rows = -(-len(panels) // _PANEL_COLUMNS)
     figure = Figure(figsize=(11, 0.9 + 1.75 * rows), layout="constrained")

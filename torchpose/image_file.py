@@ -46,7 +46,9 @@ def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
     end, start = (b"IEND", 0) if data.startswith(b"\x89PNG") else (b"\xff\xd9", data.rfind(b"\xff\xda") + 1)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if end in data[start:] else None
     if image is None:
-        raise ValueError(f"{path} must be a whole JPEG or PNG image, got {len(data)} bytes that are not")
+        raise ValueError(
+            f"{path} must be a whole JPEG or PNG image, got {len(data)} bytes that are not; copy it again"
+        )
     return image
 
 

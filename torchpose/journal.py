@@ -73,7 +73,9 @@ def read_activities_csv(path: Path | str) -> list[Entry]:
             for start, end, activity, odds in rows[1:]
         ]
     except ValueError as error:
-        raise ValueError(f"{path} must have a start, an end and an activity in each row: {error}") from error
+        raise ValueError(
+            f"{path} must have a start, an end and an activity in each row, got: {error}; make it anew"
+        ) from error
 
 
 class Journal:

@@ -123,7 +123,7 @@ class FolderRecording:
         if "depth" in images:
             colour = images.get("colour")
             return Frame(index, time_s, None if colour is None else colour[0], depth=images["depth"][0])
-        left, right = _rectify(self.calibration, images["left"], images["right"])
+        left, right = rectify_pair(self.calibration, images["left"], images["right"])
         return Frame(index, time_s, left[0], right[0])
 
     def background(self) -> Backgrounds:
@@ -131,7 +131,7 @@ class FolderRecording:
 
         Raises ValueError where one cannot be read, or where the left and the right ones do not pair up.
         """
-        return _backgrounds(self.background_folder, self.calibration)
+        return read_backgrounds(self.background_folder, self.calibration)
 
     def _read(self, stream: str, path: Path) -> Float[Tensor, "*channels height width"]:
         return _read_image(path, self.calibration, stream == "depth")
@@ -194,12 +194,12 @@ class VideoRecording:
             raise UnreadableFrame(f"frame {index} cannot be read: {error}", index, time_s) from None
         eyes = pixels if len(pixels) == 2 else np.split(pixels[0], 2, axis=1)
         left, right = (to_colour(eye)[None] for eye in eyes)
-        left, right = _rectify(self.calibration, left, right)
+        left, right = rectify_pair(self.calibration, left, right)
         return Frame(index, time_s, left[0], right[0])
 
     def background(self) -> Backgrounds:
         """The frames of the empty scene; none where there is no folder of them."""
-        return _backgrounds(self._background, self.calibration) if self._background else Backgrounds()
+        return read_backgrounds(self._background, self.calibration) if self._background else Backgrounds()
 
     def _check_sizes(self) -> None:
         camera, single = self.camera, len(self._videos) == 1
@@ -231,13 +231,14 @@ class VideoRecording:
         if lengths[0] != lengths[-1]:
             warnings.warn(
                 f"of {lengths[0]} and {lengths[1]} frames in {names} the last {max(lengths) - min(lengths)} have no "
-                "partner and are left out",
+                "partner and are left out; where they matter, cut both videos to the same moments",
                 stacklevel=3,
             )
         if not _same_rate(rates[0], self.camera.frame_rate):
             warnings.warn(
                 f"{self._videos[0].path} has {rates[0]:.4g} frames a second and the calibration says "
-                f"{self.camera.frame_rate:.4g}: times are by the calibration",
+                f"{self.camera.frame_rate:.4g}: times are by the calibration; where the video is right, "
+                "correct frame_rate there",
                 stacklevel=3,
             )
 
@@ -316,7 +317,7 @@ def _with_focal_length(recording: FolderRecording, height: float) -> FolderRecor
         raise ValueError(f"{recording.folder}: {error}") from None
     warnings.warn(
         f"the focal length was estimated as {focal_length:.0f} px from a person of {height:g} m; all lengths are as "
-        "right as that",
+        "right as that; calibrate the camera to know them",
         stacklevel=3,
     )
     camera = replace(camera, focal_length=focal_length)
@@ -423,18 +424,19 @@ def _paired_files(folder: Path, streams: list[str]) -> dict[str, dict[int, Path]
     return found
 
 
-def _rectify(
+def rectify_pair(
     calibration: Calibration,
     left: Float[Tensor, "num 3 height width"],
     right: Float[Tensor, "num 3 height width"],
 ) -> tuple[Float[Tensor, "num 3 height width"], Float[Tensor, "num 3 height width"]]:
+    """Left and right images as the calibration's rectified camera would see them; as they are where that took them."""
     if calibration.raw is None:
         return left, right
     left, right, _ = calibration.raw.rectify(left, right)
     return left, right
 
 
-def _backgrounds(folder: Path, calibration: Calibration) -> Backgrounds:
+def read_backgrounds(folder: Path, calibration: Calibration) -> Backgrounds:
     """The frames of the empty scene in a folder; ValueError where one cannot be read or has no partner."""
 
     def stack(files: Mapping[int, Path], depth: bool = False) -> Float[Tensor, "num *channels height width"]:
@@ -451,7 +453,7 @@ def _backgrounds(folder: Path, calibration: Calibration) -> Backgrounds:
         )
     if not left:
         return Backgrounds()
-    return Backgrounds(*_rectify(calibration, stack(left), stack(right)))
+    return Backgrounds(*rectify_pair(calibration, stack(left), stack(right)))
 
 
 def _read_image(

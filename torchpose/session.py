@@ -7,53 +7,48 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 import shutil
 import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
-from tqdm import tqdm
 
-from torchpose.atomic import replacing
-from torchpose.body.ellipsoid import outline
+from torchpose.atomic import require_writable
 from torchpose.export import (
     PoseSequence,
     open_video,
-    read_poses_npz,
     write_poses_csv,
     write_poses_npz,
     write_summary,
 )
 from torchpose.eyes import depth_picture
-from torchpose.figures import Overlay, draw_overlay, plot_angles
+from torchpose.figures import draw_overlay, plot_angles
+from torchpose.overlay import overlays
+from torchpose.parts import LabelledPoints, Parts, PersonParts
 from torchpose.people import People
 from torchpose.pipeline import FramePose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
 from torchpose.registration.size import write_size
+from torchpose.terminal import Progress, coloured, table
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 from torchpose.window import PeopleWindows
 
 CHECKED = 3  # frames whose rows are compared
 FEWEST = 5  # frames with a pose, from which somebody further is written
-_PARTS, _STAMP = "parts", "settings.txt"  # of a run that is not finished: their folder, and whose they are
-_SHOWN = ("elbow_flexion_left", "elbow_flexion_right", "knee_flexion_left", "knee_flexion_right")
-
-
-@dataclass(frozen=True)
-class _Labelled:
-    """The labelled points of some frames, for the overlay alone."""
-
-    pixels: Float[Tensor, "time num 2"]
-    labels: Int[Tensor, "time num"]
+SPACE = 60_000  # bytes that the parts and the files of a frame take, and some more
+_PARTS, _FILES = "parts", "files"  # folders of a run that is not finished
+_DRAWN = 50  # frames whose outlines are computed at once
+_SAME_RATE = 0.01  # relative
+_MOST_PROBLEMS = 4  # that are printed
 
 
 class Session:
@@ -75,48 +70,122 @@ class Session:
         self.people, self.model = people, people.model
         self.recording, self.output = recording, output
         self.settings, self.version, self.rows_before = settings, version, rows_before
-        self.parts = output / _PARTS
+        self.parts = Parts(output / _PARTS)
         self.problems: list[str] = []
         self.kept: list[dict[str, Tensor]] = []  # what an interrupted run goes on from, of each person
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
         """Recover all poses and write the files of an output folder.
 
-        Returns the summary. `fresh` forgets what an interrupted run left.
+        Returns the summary. `fresh` forgets what an interrupted run left. Raises UnwritableFile where the folder
+        cannot be written or its disk is full; nothing is lost then, and the same run goes on afterwards.
         """
         begin, count = time.perf_counter(), min(len(self.recording), max_frames or len(self.recording))
-        done = self._resume(fresh)
-        rows_apart = self._check_rows()
+        done = self.begin(fresh, count)
+        rows_apart = self.check_rows(self.recording)
         if done < count:
             self.people.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
-            self._follow(done, count)
-        found = self._collect()
+            self.follow(range(done, count), count)
+        notes = {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before}
+        return self.finish(begin, count - done, notes)
+
+    def begin(self, fresh: bool, count: int | None = None) -> int:
+        """How many frames an interrupted run did; what it left is removed if it is not ours, or if `fresh`.
+
+        Warns where the disk has little room for `count` frames.
+        """
+        require_writable(self.output)
+        done, key = 0, _key(self.settings, self.version)
+        if fresh or not self.parts.are_of(key):
+            self.parts.begin(key)
+        elif self.parts.ends:
+            self.kept, done = self.parts.states(), self.parts.ends[-1]
+            self.people.restore(self.kept)
+        free, needed = shutil.disk_usage(self.output).free, ((count or 0) - done) * SPACE
+        if free < needed:
+            warnings.warn(
+                f"{count} frames may take {needed / 1e9:.1f} GB and the disk of {self.output} has {free / 1e9:.1f} GB "
+                "left; free some space, or give output= on another disk",
+                stacklevel=2,
+            )
+        return done
+
+    def follow(
+        self,
+        positions: Iterable[int],
+        count: int | None,
+        watch: Callable[[list[FramePose]], None] | None = None,
+    ) -> None:
+        """Follow the frames at these positions, which begin where the parts end; a stretch that is smooth is saved.
+
+        `count` is how many frames there will be, None where nobody knows. `watch` is told each frame's poses as they
+        come, not smoothed yet.
+        """
+        windows, done = PeopleWindows(self.people.followers, self.kept), sum(self.parts.ends[-1:])
+        with Progress(count, done) as progress:
+            for position in positions:
+                result = self.people.step(self.recording, position)
+                if result[0].problem:
+                    self.problems.append(f"frame {result[0].index}: {result[0].problem}")
+                if watch is not None:
+                    watch(result)
+                self._save(windows, windows.push(result))
+                progress.step([pose.status.value for pose in result])
+            self._save(windows, windows.flush())
+
+    def finish(self, begin: float, followed: int, notes: Mapping[str, Any]) -> dict[str, Any]:
+        """Write all files, from the parts, and return the summary, to which `notes` are added.
+
+        The files are written beside the parts and then take their places together: until then what an earlier run
+        wrote still stands. `begin` is when the run began, by `time.perf_counter`; `followed` counts its frames.
+        """
+        staged = self.parts.folder / _FILES
+        shutil.rmtree(staged, ignore_errors=True)
+        found = self._found()
         with self.model.stopwatch.measure("export"):
-            for pattern in ("poses_*.csv", "poses_*.npz", "angles_*.png", "person_*.yaml"):
-                for old in self.output.glob(pattern):  # an earlier run may have found more people
-                    old.unlink()
-            for number, (sequence, _, person) in enumerate(found, 1):
-                mark = "" if number == 1 else f"_{number}"
-                write_poses_csv(self.output / f"poses{mark}.csv", sequence)
-                write_poses_npz(self.output / f"poses{mark}.npz", sequence)
-                plot_angles(self.output / f"angles{mark}.png", sequence)
-                size = self.people.followers[person].model.size
-                write_size(self.output / f"person{mark}.yaml", self.model.body, size)
-            self._draw(found)
-        sequence = found[0][0]
-        summary = self._summary(sequence, time.perf_counter() - begin, count - done)
-        summary["others"] = [dict(Counter(other.status)) for other, _, _ in found[1:]]
-        summary |= {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before}
-        write_summary(self.output / "summary.json", summary)
-        shutil.rmtree(self.parts)
+            self._write(found, staged)
+        summary = self._summary(found[0].sequence, time.perf_counter() - begin, followed)
+        summary["others"] = [dict(Counter(other.sequence.status)) for other in found[1:]]
+        summary["files"] = sorted([*(path.name for path in staged.iterdir()), "summary.json"])
+        summary |= notes
+        write_summary(staged / "summary.json", summary)
+        self._publish(staged)
+        self.parts.remove()
         return summary
 
-    def _check_rows(self) -> float | None:
+    def _found(self) -> list[PersonParts]:
+        """The first person, and others who have enough poses."""
+        people = [self.parts.person(number) for number in range(self.parts.people)]
+        return [one for one in people if one.number == 0 or sum(one.sequence.answered) >= FEWEST]
+
+    def _write(self, found: Sequence[PersonParts], folder: Path) -> None:
+        """Every file but the summary. A person's `sequence` has no covariances; `points(position)` are of a part."""
+        for number, person in enumerate(found, 1):
+            mark = "" if number == 1 else f"_{number}"
+            model = self.people.followers[person.number].model
+            write_poses_csv(folder / f"poses{mark}.csv", person.sequence)
+            write_poses_npz(folder / f"poses{mark}.npz", person.sequence, person.covariances())
+            plot_angles(folder / f"angles{mark}.png", person.sequence)
+            write_size(folder / f"person{mark}.yaml", model.body, model.size)
+        self._draw(found, folder / "overlay.mp4")
+
+    def _publish(self, staged: Path) -> None:
+        """Move the files into the output folder, and remove those of further people that an earlier run found."""
+        files = sorted(staged.iterdir())
+        names = {file.name for file in files}
+        for file in files:
+            for old in self.output.glob(f"{file.stem}_*{file.suffix}"):
+                if old.stem.removeprefix(f"{file.stem}_").isdigit() and old.name not in names:
+                    old.unlink()
+        for file in files:
+            os.replace(file, self.output / file.name)
+
+    def check_rows(self, recording: Recording) -> float | None:
         """How far apart the rows of a recording's left and right images are, px, with a warning where it spoils depth.
 
         A correction is told, too. None for a depth camera, and where too few points are seen in both images.
         """
-        frames = list(readable_frames(self.recording, spread_positions(len(self.recording), CHECKED)))
+        frames = list(readable_frames(recording, spread_positions(len(recording), CHECKED)))
         left = [frame.left for frame in frames if frame.left is not None]
         right = [frame.right for frame in frames if frame.right is not None]
         if not right:
@@ -131,145 +200,42 @@ class Session:
             warnings.warn(sentence, stacklevel=2)
         return typical
 
-    def _resume(self, fresh: bool) -> int:
-        """How many frames the parts of an interrupted run hold; they are removed if they are not ours."""
-        if fresh or not is_interrupted(self.output, self.settings, self.version):
-            shutil.rmtree(self.parts, ignore_errors=True)
-            with replacing(self.parts / _STAMP) as partial:
-                partial.write_text(_key(self.settings, self.version))
-            return 0
-        files = self._files()
-        if not files:
-            return 0
-        # The first person's part is written last: what others have beyond it is of a stretch that was not finished.
-        for person in range(self._count()):
-            state = self._folder(person) / files[-1].name.replace("poses", "state")
-            if state.exists():
-                saved = np.load(state)
-                self.kept.append({name: torch.from_numpy(saved[name]) for name in saved.files})
-        self.people.restore(self.kept)
-        return sum(len(read_poses_npz(file)) for file in files)
-
-    def _folder(self, person: int) -> Path:
-        """Where the parts of a person are, counted from 0."""
-        return self.parts if person == 0 else self.parts / f"person_{person + 1}"
-
-    def _count(self) -> int:
-        """How many people have parts."""
-        return 1 + len(list(self.parts.glob("person_*")))
-
-    def _files(self) -> list[Path]:
-        return sorted(self.parts.glob("poses_*.npz"))
-
-    def _follow(self, done: int, count: int) -> None:
-        """Frames `done` to `count`, saved whenever a stretch of them is smooth."""
-        windows = PeopleWindows(self.people.followers, self.kept)
-        with tqdm(
-            total=count, initial=done, unit="frame", disable=not sys.stderr.isatty(), leave=False
-        ) as bar:
-            for position in range(done, count):
-                result = self.people.step(self.recording, position)
-                if result[0].problem:
-                    self.problems.append(f"frame {result[0].index}: {result[0].problem}")
-                ready = windows.push(result)
-                ready += windows.flush() if position == count - 1 else []
-                bar.set_postfix_str(result[0].status.value)
-                bar.update()
-                if ready:
-                    done += len(ready)
-                    for person in reversed(range(len(windows.windows))):
-                        state = windows.windows[person].state
-                        if state:
-                            self._save(person, done, [frame[person] for frame in ready], state)
-
-    def _save(self, person: int, end: int, frames: list[FramePose], kept: Mapping[str, Tensor]) -> None:
-        """One part of a person: labelled points, what the next frame starts from, and last the poses."""
-        folder = self._folder(person)
-        num = max((f.sight.cloud.mask.shape[1] for f in frames if f.sight is not None), default=1)
-        pixels, labels = (
-            np.full((len(frames), num, 2), np.nan, np.float32),
-            np.full((len(frames), num), -1, np.int8),
+    def _save(self, windows: PeopleWindows, ready: list[list[FramePose]]) -> None:
+        """Frames that are smooth, of everybody, as one part."""
+        if not ready:
+            return
+        people = list(zip(*ready, strict=True))
+        self.parts.save(
+            sum(self.parts.ends[-1:]) + len(ready),
+            [
+                follower.model.sequence(list(frames))
+                for follower, frames in zip(self.people.followers, people, strict=False)
+            ],
+            [[LabelledPoints.of(frame) for frame in frames] for frames in people],
+            [window.state for window in windows.windows],
         )
-        for i, frame in enumerate(frames):
-            if frame.sight is not None and frame.registration is not None:
-                seen = frame.sight.cloud.mask[0].cpu()
-                pixels[i, seen] = frame.sight.cloud.pixels[0].cpu()[seen]
-                labels[i, seen] = frame.registration.belief[0].argmax(0).cpu()[seen]
-        with replacing(folder / f"points_{end:08d}.npz") as partial:
-            np.savez(partial, pixels=pixels, labels=labels)
-        state = {name: value.cpu().numpy() for name, value in kept.items()}
-        with replacing(folder / f"state_{end:08d}.npz") as partial:
-            np.savez_compressed(partial, allow_pickle=False, **state)
-        model = self.people.followers[person].model
-        write_poses_npz(folder / f"poses_{end:08d}.npz", model.sequence(frames))
 
-    def _collect(self) -> list[tuple[PoseSequence, _Labelled, int]]:
-        """Poses and labelled points of the first person, and of others who have enough poses, with their numbers."""
-        found = []
-        for person in range(self._count()):
-            poses, points = [], []
-            for file in self._files():
-                first, own = read_poses_npz(file), self._folder(person) / file.name
-                poses.append(read_poses_npz(own) if own.exists() else first.of_nobody())
-                points.append(self._points(own, len(first)))
-            sequence = PoseSequence.join(poses)
-            if person == 0 or int(np.sum(sequence.answered)) >= FEWEST:
-                most = max(labels.shape[1] for _, labels in points)
-                pixels, labels = (
-                    np.concatenate(
-                        [
-                            np.pad(
-                                part,
-                                [(0, 0), (0, most - part.shape[1])] + [(0, 0)] * (part.ndim - 2),
-                                constant_values=nothing,
-                            )
-                            for part in parts
-                        ]
+    def _draw(self, found: Sequence[PersonParts], path: Path) -> None:
+        """The overlay video, from the recording's images and the poses; it takes as long as the recording did."""
+        camera, times = self.model.camera, found[0].sequence.time_s
+        with open_video(path, camera.width, camera.height, video_rate(times, camera.frame_rate)) as video:
+            for start in range(0, len(times), _DRAWN):
+                positions = range(start, min(start + _DRAWN, len(times)))
+                layers = [
+                    overlays(
+                        self.people.followers[person.number].model,
+                        person.sequence[start : start + _DRAWN],
+                        [person.points(position) for position in positions],
+                        words=person.number == 0,
                     )
-                    for parts, nothing in zip(zip(*points, strict=True), (np.nan, -1), strict=True)
-                )
-                labelled = _Labelled(torch.from_numpy(pixels), torch.from_numpy(labels).long())
-                found.append((sequence, labelled, person))
-        return found
-
-    def _points(self, poses: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Labelled points of a part, none where a person has none."""
-        file = poses.with_name(poses.name.replace("poses", "points"))
-        if not file.exists():
-            return np.zeros((count, 0, 2), np.float32), np.zeros((count, 0), np.int8)
-        part = np.load(file)
-        return part["pixels"], part["labels"]
-
-    def _draw(self, found: list[tuple[PoseSequence, _Labelled, int]]) -> None:
-        """The overlay video, from the recording's images and the poses."""
-        camera = self.model.camera
-        with open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate) as video:
-            for i in range(len(found[0][0])):
-                image = self._image(i)
-                for sequence, labelled, person in found:
-                    if person == 0 or sequence.answered[i]:
-                        image = draw_overlay(image, self._overlay(sequence, labelled, person, i))
-                video.write(image)
-
-    def _overlay(self, sequence: PoseSequence, labelled: _Labelled, person: int, i: int) -> Overlay:
-        """What is drawn of a person in a frame; words of the first alone."""
-        camera, body, size = self.model.camera, self.model.body, self.people.followers[person].model.size
-        assert sequence.pose is not None
-        status = sequence.status[i] if person == 0 else ""
-        if not bool(sequence.pose[i].isfinite().all()):
-            return Overlay(status)
-        posed = body(sequence.pose[i : i + 1].to(size), size)
-        shown = [sequence.angle_names.index(name) for name in _SHOWN]
-        angles = sequence.angles[i, shown].rad2deg().round().int().tolist()
-        lines = (f"elbow L {angles[0]}  R {angles[1]}", f"knee  L {angles[2]}  R {angles[3]}")
-        return Overlay(
-            status,
-            camera.project(outline(posed))[0].cpu(),
-            camera.project(posed.joints)[0].cpu(),
-            labelled.pixels[i],
-            labelled.labels[i],
-            lines if person == 0 else (),
-        )
+                    for person in found
+                ]
+                for position, drawn in zip(positions, zip(*layers, strict=True), strict=True):
+                    image = self._image(position)
+                    for number, overlay in enumerate(drawn):
+                        if number == 0 or overlay.outlines is not None:
+                            image = draw_overlay(image, overlay)
+                    video.write(image)
 
     def _image(self, position: int) -> Float[Tensor, "3 height width"]:
         """What a person sees of a frame: its left image, its depth as grey, or black where it cannot be read."""
@@ -312,10 +278,18 @@ class Session:
         }
 
 
+def video_rate(time_s: Float[Tensor, " time"], rate: float) -> float:
+    """Frames a second, Hz, at which a video lasts as long as these frames did; the camera's `rate` if that fits."""
+    elapsed = float(time_s[-1] - time_s[0]) if len(time_s) > 1 else 0.0
+    if not elapsed > 0:
+        return rate
+    measured = (len(time_s) - 1) / elapsed
+    return rate if abs(measured - rate) <= _SAME_RATE * rate else max(round(measured, 2), 0.1)
+
+
 def is_interrupted(output: Path, settings: Mapping[str, Any], version: str) -> bool:
     """Whether a folder holds an interrupted run with these settings, which `Session.run` goes on with."""
-    stamp = output / _PARTS / _STAMP
-    return stamp.is_file() and stamp.read_text() == _key(settings, version)
+    return Parts(output / _PARTS).are_of(_key(settings, version))
 
 
 def _key(settings: Mapping[str, Any], version: str) -> str:
@@ -324,29 +298,41 @@ def _key(settings: Mapping[str, Any], version: str) -> str:
     return hashlib.sha256(json.dumps([settings, version], sort_keys=True, default=str).encode()).hexdigest()
 
 
-def summary_table(summary: Mapping[str, Any], output: Path) -> str:
-    """What a person wants to know at the end, in a few lines."""
-    status = ", ".join(f"{count} {name}" for name, count in summary["status"].items())
+def summary_table(summary: Mapping[str, Any], output: Path, columns: int) -> str:
+    """What a person wants to know at the end: at most 20 lines of so many columns."""
     distance = summary["point_to_model_m"]["mean"]
-    fitted = "-" if math.isnan(distance) else f"{1000 * distance:.1f} mm"
-    lines = [
-        f"frames            {summary['frames']}: {status}",
-        f"answered          {100 * summary['answered']:.1f} %",
-        f"point to model    {fitted}",
-        f"time              {summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame",
-        "CPU ms a frame    "
-        + ", ".join(f"{name} {ms:.0f}" for name, ms in summary["cpu_ms_per_frame"].items()),
-        *(
-            f"person {number}          " + ", ".join(f"{count} {name}" for name, count in other.items())
-            for number, other in enumerate(summary["others"], 2)
-        ),
-        f"results           {output}/ poses.csv, poses.npz, person.yaml, overlay.mp4, angles.png, summary.json",
+    share = 100 * summary["answered"]
+    stages = sorted(summary["cpu_ms_per_frame"].items(), key=lambda stage: -stage[1])
+    rows = [
+        ("frames", f"{summary['frames']}: {_counted(summary['status'])}"),
+        ("answered", f"{share:.1f} %" + ("" if share > 0 else ": no frame has a pose")),
+        ("point to model", "-" if math.isnan(distance) else f"{1000 * distance:.1f} mm"),
+        *((f"person {k}", _counted(other)) for k, other in enumerate(summary["others"], 2)),
+        ("time", f"{summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame"),
+        ("CPU ms a frame", ", ".join(f"{name} {ms:.0f}" for name, ms in stages)),
+        ("results", f"{output}/ {', '.join(summary['files'])}"),
     ]
+    if "live" in summary:
+        live = summary["live"]
+        words = (
+            f"{live['offered']} pairs in {live['seconds']:.1f} s: {live['followed']} followed, {live['dropped']} "
+            f"dropped ({100 * live['drop_rate']:.1f} %), {live['missed_by_camera']} missed by the camera; "
+            "recording/ has all that came"
+        )
+        rows.insert(1, ("live", words))
+    lines = table(rows, columns, most=3)
     problems = summary["problems"]
-    lines += [f"problem           {problem}" for problem in problems[:5]]
-    if len(problems) > 5:
-        lines.append(f"                  and {len(problems) - 5} more, see summary.json")
+    told = [("problem", problem) for problem in problems[:_MOST_PROBLEMS]]
+    if len(problems) > _MOST_PROBLEMS:
+        told[_MOST_PROBLEMS - 1 :] = [
+            ("", f"and {len(problems) - _MOST_PROBLEMS + 1} more, see summary.json")
+        ]
+    lines += [coloured(line, "yellow") for line in table(told, columns, most=1)]
     return "\n".join(lines)
+
+
+def _counted(status: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in status.items())
 
 
 def settings_of(config: Any) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 Config = TypeVar("Config")
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
-_WIDEST_SETTING = 48  # columns; the meaning of a longer one goes below it
 
 
 def compose_config(
@@ -42,7 +41,7 @@ def compose_config(
     for override in overrides:
         key, equals, value = override.partition("=")
         if not key or not equals:
-            raise ValueError(f"settings must be given as key=value, got {override!r}; --help lists them all")
+            raise ValueError(f"settings must be given as key=value, got {override!r}; --help-all lists them")
         if key not in groups:
             values[key] = value
         elif value in groups[key]:
@@ -68,15 +67,9 @@ def config_groups(folder: Path, name: str) -> dict[str, list[str]]:
     return {group: sorted(path.stem for path in (folder / group).glob("*.yaml")) for group in groups}
 
 
-def describe(config: object, prefix: str = "") -> str:
-    """Every setting of a dataclass as a line `key=value  comment`, with the comment in its source."""
-    lines = []
-    for setting, meaning in _rows(config, prefix):
-        if len(setting) > _WIDEST_SETTING:
-            lines += [f"  {setting}", f"  {'':<{_WIDEST_SETTING}}  {meaning}".rstrip()]
-        else:
-            lines.append(f"  {setting:<{_WIDEST_SETTING}}  {meaning}".rstrip())
-    return "\n".join(lines)
+def setting_rows(config: object, prefix: str = "") -> list[tuple[str, str]]:
+    """Every setting of a dataclass as `key=value` with its meaning, the comment beside it; nested ones come last."""
+    return list(_rows(config, prefix))
 
 
 def _compose(folder: Path, name: str, choices: list[str]) -> DictConfig:
@@ -189,7 +182,8 @@ def _build(config_type: type, values: Mapping[str, Any], prefix: str = "") -> An
     try:
         return config_type(**arguments)
     except ValueError as error:
-        raise ValueError(f"{prefix}{error}") from None
+        remedy = "" if ";" in str(error) else "; correct it, --help-all says what it means"
+        raise ValueError(f"{prefix}{error}{remedy}") from None
 
 
 def _rows(config: Any, prefix: str) -> Iterator[tuple[str, str]]:

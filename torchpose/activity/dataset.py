@@ -106,7 +106,7 @@ def split_clips(clips: Sequence[Clip], split: Split | str, splits: int = 5, seed
     if (len(clips) if by_sequence else len(subjects)) < 2:
         raise ValueError(
             f"split {split.value} needs at least two subjects or sequences to tell training from test, got "
-            f"{len(clips)} sequences by {len(subjects)} subjects"
+            f"{len(clips)} sequences by {len(subjects)} subjects; give more, or another split"
         )
     match split:
         case Split.leave_one_sequence_out:
@@ -151,9 +151,13 @@ def read_skeletons(path: Path | str, dtype: torch.dtype = torch.float32) -> list
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in _FIELDS if name in archive}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} must be an .npz of plain arrays, but it cannot be read: {error}") from error
+        raise ValueError(
+            f"{path} must be an .npz of plain arrays, but it cannot be read: {error}; write it by numpy.savez"
+        ) from error
     except TypeError as error:  # an .npy is an array, which is no context manager
-        raise ValueError(f"{path} must be an .npz with several arrays, got a single array") from error
+        raise ValueError(
+            f"{path} must be an .npz with several arrays, got a single array; write it by numpy.savez"
+        ) from error
     missing = [name for name in _FIELDS if name not in arrays]
     if missing:
         raise ValueError(f"{path} must hold {', '.join(_FIELDS)}; it lacks {', '.join(missing)}")
@@ -163,16 +167,16 @@ def read_skeletons(path: Path | str, dtype: torch.dtype = torch.float32) -> list
     if joints.ndim != 3 or joints.shape[1:] != (len(names), 3) or joints.dtype.kind != "f":
         raise ValueError(
             f"joints in {path} must be floating point of shape (frames, {len(names)} joint_names, 3), got "
-            f"{joints.dtype} {joints.shape}"
+            f"{joints.dtype} {joints.shape}; name every joint once"
         )
     if offsets.ndim != 1 or offsets.dtype.kind not in "iu" or len(offsets) < 2 or offsets[0] != 0:
         raise ValueError(
             f"offsets in {path} must be integers that start with 0 and end with the number of frames, got "
-            f"{offsets.dtype} {offsets.shape} from {offsets.ravel()[:1]}"
+            f"{offsets.dtype} {offsets.shape} from {offsets.ravel()[:1]}; they are where each sequence begins"
         )
     if offsets[-1] != len(joints):
         raise ValueError(
-            f"offsets in {path} must end with the number of frames, {len(joints)}, got {offsets[-1]}"
+            f"offsets in {path} must end with the number of frames, {len(joints)}, got {offsets[-1]}; add the last one"
         )
     steps = np.diff(offsets.astype(np.int64))
     if (steps < 1).any():
@@ -183,7 +187,9 @@ def read_skeletons(path: Path | str, dtype: torch.dtype = torch.float32) -> list
     for name in ("label", "subject", "take"):
         if arrays[name].shape != steps.shape:
             shape = arrays[name].shape
-            raise ValueError(f"{name} in {path} must have one entry a sequence, {len(steps)}, got {shape}")
+            raise ValueError(
+                f"{name} in {path} must have one entry a sequence, {len(steps)}, got {shape}; add them"
+            )
 
     positions = torch.from_numpy(joints).to(dtype)
     lost = ~positions.isfinite().all(2).all(1) | (positions == 0).all(2).all(1)

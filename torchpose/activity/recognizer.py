@@ -234,7 +234,9 @@ class Recognizer(nn.Module):
         labels = _labels(clips, activities)
         untaught = [name for number, name in enumerate(activities) if number not in labels.tolist()]
         if untaught:
-            raise ValueError(f"every activity needs a training clip, got none for {', '.join(untaught)}")
+            raise ValueError(
+                f"every activity needs a training clip, got none for {', '.join(untaught)}; add some"
+            )
 
         own = len(clips)
         subjects = [clip.subject for clip in clips]
@@ -257,7 +259,8 @@ class Recognizer(nn.Module):
             empty = [name for name, end in zip(activities, status, strict=True) if end == Status.NO_DATA]
             if empty:
                 raise ValueError(
-                    f"every activity needs frames in which the person was seen, got none for {', '.join(empty)}"
+                    f"every activity needs frames in which the person was seen, got none for {', '.join(empty)}; "
+                    "look at their recordings"
                 )
             courses.append(training)
             encoded.append(symbols)

@@ -69,7 +69,7 @@ def joint_index(names: tuple[str, ...]) -> Mapping[str, int]:
     if missing:
         raise ValueError(
             f"a skeleton needs both shoulders and both hips, but {', '.join(missing)} cannot be found in "
-            f"joint_names {', '.join(names)}"
+            f"joint_names {', '.join(names)}; name them so"
         )
     return MappingProxyType(index)  # shared by all who ask
 

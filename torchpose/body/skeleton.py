@@ -156,7 +156,7 @@ def load_skeleton(path: Path | str = HUMAN) -> Skeleton:
             f"{path}: a body file needs the keys of human.yaml; wrong or missing here: {error}"
         ) from error
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {error}; correct it, human.yaml in torchpose/body shows how") from error
 
 
 @contextmanager

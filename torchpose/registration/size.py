@@ -114,7 +114,9 @@ def read_size(path: Path, body: BodyModel) -> Float[Tensor, "1 sizes"]:
     try:
         rows = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:
-        raise ValueError(f"{path} must be YAML with a number for each size, got: {error}") from error
+        raise ValueError(
+            f"{path} must be YAML with a number for each size, got: {error}; give the person.yaml of another run"
+        ) from error
     if not isinstance(rows, dict) or set(rows) != set(body.size_names):
         raise ValueError(
             f"{path} must hold the sizes {list(body.size_names)}, got {rows}; measure the person anew"
@@ -125,7 +127,10 @@ def read_size(path: Path, body: BodyModel) -> Float[Tensor, "1 sizes"]:
         if isinstance(v, bool) or not isinstance(v, int | float) or not SMALLEST <= v <= LARGEST
     }
     if wrong:
-        raise ValueError(f"sizes in {path} must lie between {SMALLEST} and {LARGEST}, got {wrong}")
+        raise ValueError(
+            f"sizes in {path} must lie between {SMALLEST} and {LARGEST}, got {wrong}; "
+            "correct them, or give the person.yaml of another run"
+        )
     return torch.tensor([[float(rows[name]) for name in body.size_names]]).to(body.axes)
 
 

@@ -223,7 +223,10 @@ def compiling_works(device: str) -> bool:
         torch.compile(torch.sin)(torch.ones(2, device=device))
     except Exception as error:  # every backend has its own
         reason = str(error).strip().splitlines()[0]
-        warnings.warn(f"compile=true needs a compiler, going on without: {reason}", stacklevel=3)
+        warnings.warn(
+            f"compile=true needs a compiler, going on without: {reason}; install one, or leave compile=false",
+            stacklevel=3,
+        )
         return False
     return True
 

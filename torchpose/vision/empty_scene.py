@@ -193,7 +193,8 @@ def clear_depth(
     names = ", ".join(str(k) for k in wrong.nonzero()[:, 0].tolist())
     warnings.warn(
         f"somebody or something stands in the background that the recording sees behind, in {int(wrong.sum())} of "
-        f"{len(wrong)} background frames ({names}); what is behind is taken from the recording",
+        f"{len(wrong)} background frames ({names}); what is behind is taken from the recording; "
+        "record the empty scene anew into its folder background/",
         stacklevel=2,
     )
     clear = backgrounds.masked_fill(hidden, torch.nan)
