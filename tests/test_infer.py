@@ -58,7 +58,10 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_every_file_is_there_and_nothing_else(result: Path):
     names = {path.name for path in result.iterdir()}
-    assert names == {"poses.csv", "poses.npz", "person.yaml", "overlay.mp4", "angles.png", "summary.json"}
+    assert names == {
+        *("poses.csv", "poses.npz", "poses.mot", "poses.trc", "poses.bvh"),
+        *("person.yaml", "overlay.mp4", "angles.png", "summary.json"),
+    }
 
 
 def test_the_table_has_the_contract_s_columns_and_a_row_a_frame(result: Path):

@@ -68,7 +68,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "learning": ("part_network", "training"),
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
-        *("export", "figures", "timeline", "journal", "activities"),
+        *("export", "trajectory_filter", "resampling", "opensim", "bvh", "c3d_file", "motion_export"),
+        *("figures", "timeline", "journal", "activities"),
         *("eyes", "pipeline", "window", "people", "session", "clips", "study", "cli"),
     ),
 }
@@ -84,7 +85,7 @@ FORBIDDEN = {
     )
 }
 # Slow or optional: imported where they are used.
-NOT_AT_TOP = {"matplotlib", "pytorch_kinematics", "rerun", "ray", "tensorboard"}
+NOT_AT_TOP = {"matplotlib", "pytorch_kinematics", "rerun", "ray", "tensorboard", "ezc3d"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -23,6 +23,7 @@ from torchpose.aligned import AlignedRecording, align_recording
 from torchpose.capture import camera_numbers, capture_recording, open_cameras
 from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.eyes import EyesConfig
+from torchpose.motion_export import ExportConfig
 from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
@@ -70,6 +71,7 @@ class InferConfig:
     eyes: EyesConfig = field(default_factory=EyesConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     people: PeopleConfig = field(default_factory=PeopleConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
     recognizer: str | None = (
         None  # folder of a trained one, runs/train/recognizers/angles: writes activities.csv
     )
@@ -222,7 +224,9 @@ def infer(config: InferConfig, device: torch.device) -> None:
             rows_before = recording.alignment.typical * shrunk
     recording = at_most(recording, config.max_width)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    session = Session(People(model, config.people), recording, output, settings, __version__, rows_before)
+    session = Session(
+        People(model, config.people), recording, output, settings, __version__, rows_before, config.export
+    )
     print(summary_table(session.run(config.fresh, config.max_frames), output))
     if activities is not None:
         print(activity_lines(activities.write(output, model.body, str(output.resolve()))))

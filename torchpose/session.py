@@ -35,6 +35,7 @@ from torchpose.export import (
 )
 from torchpose.eyes import depth_picture
 from torchpose.figures import Overlay, draw_overlay, plot_angles
+from torchpose.motion_export import ExportConfig, export_motion, motion_patterns
 from torchpose.people import People
 from torchpose.pipeline import FramePose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
@@ -71,10 +72,13 @@ class Session:
         settings: Mapping[str, Any],
         version: str,
         rows_before: float | None = None,
+        export: ExportConfig | None = None,
     ):
         self.people, self.model = people, people.model
         self.recording, self.output = recording, output
         self.settings, self.version, self.rows_before = settings, version, rows_before
+        self.export = export or ExportConfig()
+        self.export.check_rate(recording.camera.frame_rate)
         self.parts = output / _PARTS
         self.problems: list[str] = []
         self.kept: list[dict[str, Tensor]] = []  # what an interrupted run goes on from, of each person
@@ -92,7 +96,9 @@ class Session:
             self._follow(done, count)
         found = self._collect()
         with self.model.stopwatch.measure("export"):
-            for pattern in ("poses_*.csv", "poses_*.npz", "angles_*.png", "person_*.yaml"):
+            notes: dict[str, Any] = {}
+            old_files = ("poses_*.csv", "poses_*.npz", "angles_*.png", "person_*.yaml", *motion_patterns())
+            for pattern in old_files:
                 for old in self.output.glob(pattern):  # an earlier run may have found more people
                     old.unlink()
             for number, (sequence, _, person) in enumerate(found, 1):
@@ -102,11 +108,12 @@ class Session:
                 plot_angles(self.output / f"angles{mark}.png", sequence)
                 size = self.people.followers[person].model.size
                 write_size(self.output / f"person{mark}.yaml", self.model.body, size)
+                notes |= export_motion(self.output, mark, sequence, self.model.body, size, self.export)
             self._draw(found)
         sequence = found[0][0]
         summary = self._summary(sequence, time.perf_counter() - begin, count - done)
         summary["others"] = [dict(Counter(other.status)) for other, _, _ in found[1:]]
-        summary |= {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before}
+        summary |= {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before, "bvh": notes}
         write_summary(self.output / "summary.json", summary)
         shutil.rmtree(self.parts)
         return summary
@@ -329,6 +336,7 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
     status = ", ".join(f"{count} {name}" for name, count in summary["status"].items())
     distance = summary["point_to_model_m"]["mean"]
     fitted = "-" if math.isnan(distance) else f"{1000 * distance:.1f} mm"
+    kinds = ",".join(sorted({path.suffix[1:] for path in output.glob("poses*.*")}))
     lines = [
         f"frames            {summary['frames']}: {status}",
         f"answered          {100 * summary['answered']:.1f} %",
@@ -340,7 +348,13 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
             f"person {number}          " + ", ".join(f"{count} {name}" for name, count in other.items())
             for number, other in enumerate(summary["others"], 2)
         ),
-        f"results           {output}/ poses.csv, poses.npz, person.yaml, overlay.mp4, angles.png, summary.json",
+        *(
+            f"{name:<18}holds the longest stretch of poses, {note['frames']} frames from {note['first_frame']} on; "
+            f"{note['left_out']} poses are outside"
+            for name, note in summary.get("bvh", {}).items()
+            if note["left_out"]
+        ),
+        f"results           {output}/ poses.{{{kinds}}}, person.yaml, overlay.mp4, angles.png, summary.json",
     ]
     problems = summary["problems"]
     lines += [f"problem           {problem}" for problem in problems[:5]]
