@@ -169,7 +169,7 @@ def _motion(
         local.append((above.mT @ R)[:, bodies].numpy())
         places.append(posed.origins[:, 0].double().numpy(force=True))
     turns = _euler(np.concatenate(local) * _FLIP[:, None] * _FLIP)
-    return _CM * np.concatenate(places) * _FLIP, np.rad2deg(turns).reshape(len(sequence), -1)
+    return _CM * np.concatenate(places) * _FLIP, np.rad2deg(turns).reshape(len(sequence), 3 * len(bodies))
 
 
 def _euler(R: Float[np.ndarray, "time bodies 3 3"]) -> Float[np.ndarray, "time bodies 3"]:
@@ -188,5 +188,5 @@ def _euler(R: Float[np.ndarray, "time bodies 3 3"]) -> Float[np.ndarray, "time b
         return np.abs(np.remainder(one - two + np.pi, 2 * np.pi) - np.pi).sum(-1)
 
     swap = apart(other[1:], first[:-1]) < apart(first[1:], first[:-1])  # whether the frame changes sides
-    swapped = np.concatenate([np.zeros_like(swap[:1]), swap]).cumsum(0) % 2 == 1
+    swapped = np.concatenate([np.zeros_like(z[:1], dtype=bool), swap]).cumsum(0) % 2 == 1
     return np.unwrap(np.where(swapped[..., None], other, first), axis=0)
