@@ -212,6 +212,17 @@ class TestExport:
         with pytest.raises(ValueError, match=r"export.cutoff must be below half of the 10 frames a second"):
             config.check_rate(10.0)
 
+    def test_a_camera_that_dropped_frames_costs_the_filter_and_not_the_run(
+        self, body: BodyModel, size: torch.Tensor, tmp_path: Path
+    ) -> None:
+        sequence = rows_of(moving(body, size), slice(0, 24, 2))
+        config = ExportConfig(formats=(ExportFormat.mot,), filter=FilterKind.butterworth)
+        with pytest.warns(
+            UserWarning, match=r"below half of the 10 frames a second .* poses_3 is not filtered"
+        ):
+            export_motion(tmp_path, "_3", sequence, body, size, config)
+        assert {path.name for path in tmp_path.iterdir()} == {"poses_3.mot"}
+
     def test_c3d_without_its_extra_is_said_before_anything_runs(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:

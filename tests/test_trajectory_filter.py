@@ -269,8 +269,17 @@ class TestResampling:
         assert resample(motion(5, gone=(0, 1, 2, 3, 4)), RATE).status == ("lost",) * 5
         assert len(resample(part(motion(5), slice(0, 0)), RATE)) == 0
 
+    def test_every_other_frame_is_half_the_rate(self) -> None:
+        sequence = part(motion(40), [t for t in range(0, 40, 2) if t != 10])
+        assert frame_rate(sequence) == RATE / 2
+        got = resample(sequence, frame_rate(sequence))
+        assert got.frame.tolist() == list(range(0, 40, 2))
+        assert [t for t, status in zip(got.frame.tolist(), got.status, strict=True) if status == "lost"] == [
+            10
+        ]
+
     def test_the_rate_counts_dropped_frames(self) -> None:
-        assert frame_rate(part(motion(30, rate=15.0), [0, 3, 4, 29])) == 15.0
+        assert frame_rate(part(motion(30, rate=15.0), [0, 3, 4, 5, 29])) == 15.0
         assert frame_rate(part(motion(5), slice(2, 3))) == 30.0
         with pytest.raises(ValueError, match="time_s and frame must increase from row to row"):
             frame_rate(part(motion(5), [0, 2, 1]))

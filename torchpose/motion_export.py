@@ -1,5 +1,6 @@
 """The motion for other programs, beside `poses.csv`: which files, and what smooths them."""
 
+import warnings
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -13,7 +14,7 @@ from torchpose.bvh import GAP, write_bvh
 from torchpose.c3d_file import check_c3d, write_c3d
 from torchpose.export import PoseSequence, write_poses_csv
 from torchpose.opensim import write_mot, write_trc
-from torchpose.trajectory_filter import FilterKind, filter_sequence
+from torchpose.trajectory_filter import FilterKind, filter_sequence, usual_rate
 
 
 class ExportFormat(Enum):
@@ -84,7 +85,16 @@ def export_motion(
     Returns, for each file that may not hold every pose, which is the BVH, its first frame, its number of frames, and
     how many of the recording's frames with a pose it leaves out.
     """
-    if config.filter is not FilterKind.none:
+    rate = usual_rate(sequence.time_s.double().numpy(force=True))
+    if (
+        config.filter is FilterKind.butterworth and config.cutoff >= rate / 2
+    ):  # of a camera that dropped half its frames
+        warnings.warn(
+            f"export.cutoff must be below half of the {rate:g} frames a second that were recorded, got "
+            f"{config.cutoff:g} Hz; poses{mark} is not filtered, tp.filter_sequence can do it with a lower cutoff",
+            stacklevel=2,
+        )
+    elif config.filter is not FilterKind.none:
         sequence = filter_sequence(
             sequence,
             config.filter,

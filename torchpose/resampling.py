@@ -15,7 +15,7 @@ _NEIGHBOURS = 1.5  # frames; what is nearer to each other has no gap between
 
 
 def frame_rate(sequence: PoseSequence) -> float:
-    """Frames a second of the camera, by the frames' numbers: what was dropped counts. 30 where there is one frame.
+    """Frames a second, by the frames' numbers and their usual step, so dropped ones count; 30 where there is one frame.
 
     Raises ValueError where time does not go on.
     """
@@ -26,7 +26,12 @@ def frame_rate(sequence: PoseSequence) -> float:
         raise ValueError(
             "time_s and frame must increase from row to row; sort the sequence, and give each frame once"
         )
-    return round(float((frame[-1] - frame[0]) / (time[-1] - time[0])), 3)
+    return round(float((frame[-1] - frame[0]) / (time[-1] - time[0])) / _step(sequence), 3)
+
+
+def _step(sequence: PoseSequence) -> int:
+    """By how much a frame's number usually exceeds the one before: 2 where every other image was kept."""
+    return int(sequence.frame.diff().median()) if len(sequence) > 1 else 1
 
 
 def resample(sequence: PoseSequence, rate: float, gap: float = 0.0) -> PoseSequence:
@@ -37,8 +42,8 @@ def resample(sequence: PoseSequence, rate: float, gap: float = 0.0) -> PoseSeque
             interpolated (yaw, pitch and roll the short way round). Neighbours have no gap between.
 
     Returns:
-        A sequence without stale numbers, numbered on from the first frame. A moment in a longer gap is `lost`; others
-        have the status of the nearest frame with a pose.
+        A sequence without stale numbers, numbered on from the first frame by the usual step. A moment in a longer gap
+        is `lost`; others have the status of the nearest frame with a pose.
     """
     clean = sequence.without_stale_numbers()
     time, answered = clean.time_s, torch.tensor(clean.answered, dtype=torch.bool)
@@ -72,7 +77,7 @@ def resample(sequence: PoseSequence, rate: float, gap: float = 0.0) -> PoseSeque
     nearest = torch.where(share < 0.5, left, right).tolist()
     return replace(
         clean,
-        frame=clean.frame[0] + torch.arange(count),
+        frame=clean.frame[0] + _step(clean) * torch.arange(count),
         time_s=moment,
         status=tuple(
             clean.status[row] if known_here else EMPTY_STATUSES[-1]

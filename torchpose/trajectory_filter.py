@@ -122,10 +122,15 @@ def smooth_rts(values: Series, time: Float[np.ndarray, " time"], cutoff: float) 
     return kalman_smoother(past.filtered, past.predicted.mean, move, spread).mean[..., 0].mT.numpy()
 
 
+def usual_rate(time: Float[np.ndarray, " time"]) -> float:
+    """Rows a second, by the median of their steps; infinite where there is none."""
+    return 1 / float(np.median(np.diff(time))) if len(time) > 1 else math.inf
+
+
 def stretches(answered: Bool[np.ndarray, " time"], time: Float[np.ndarray, " time"]) -> list[slice]:
     """Runs of frames that all have a pose, none missing between them."""
-    usual = np.median(np.diff(time)) if len(time) > 1 else math.inf
-    broken = np.concatenate([[True], (np.diff(time) > _BREAK * usual) | ~answered[1:] | ~answered[:-1]])
+    late = np.diff(time) > _BREAK / usual_rate(time)
+    broken = np.concatenate([[True], late | ~answered[1:] | ~answered[:-1]])
     starts = np.flatnonzero(broken)
     runs = zip(starts, [*starts[1:], len(time)], strict=True) if len(time) else ()
     return [slice(int(start), int(stop)) for start, stop in runs if answered[start]]
@@ -158,12 +163,13 @@ def filter_sequence(
     if kind is FilterKind.none:
         return clean
     time = clean.time_s.numpy()
+    rate = usual_rate(time)
 
     def smooth(values: Series, moments: np.ndarray) -> Series:
         if len(values) < 2:
             return values
         if kind is FilterKind.butterworth:
-            return butterworth(values, 1 / float(np.median(np.diff(moments))), cutoff, order)
+            return butterworth(values, rate, cutoff, order)
         if kind is FilterKind.one_euro:
             return one_euro(values, moments, min_cutoff, beta, speed_cutoff)
         return smooth_rts(values, moments, cutoff)
