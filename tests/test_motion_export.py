@@ -20,6 +20,7 @@ from torchpose.cli import infer_main
 from torchpose.export import JOINT_NAMES, PoseSequence, read_poses_csv
 from torchpose.motion_export import ExportConfig, ExportFormat, export_motion
 from torchpose.opensim import MARKERS, to_opensim
+from torchpose.session import summary_table
 from torchpose.trajectory_filter import FilterKind, filter_sequence
 
 
@@ -175,6 +176,34 @@ class TestExport:
         np.testing.assert_allclose(
             trc[:, 2:5], 1000 * to_opensim(filtered.joints[:, 0]), atol=6e-4, equal_nan=True
         )
+
+    def test_the_summary_says_that_poses_are_outside(self, tmp_path: Path) -> None:
+        summary = {
+            "frames": 40,
+            "status": {"tracked": 30, "lost": 10},
+            "answered": 0.75,
+            "point_to_model_m": {"mean": 0.01},
+            "bvh": {
+                "poses.bvh": {"first_frame": 7, "frames": 20, "left_out": 10},
+                "poses_2.bvh": {"first_frame": 0, "frames": 40, "left_out": 0},
+            },
+        }
+        rest = {
+            "seconds": 1.0,
+            "seconds_per_frame": 0.5,
+            "cpu_ms_per_frame": {},
+            "problems": [],
+            "others": [],
+        }
+        for name in ("poses.csv", "poses.bvh", "poses_2.bvh"):
+            (tmp_path / name).touch()
+        lines = summary_table(summary | rest, tmp_path).splitlines()
+        assert (
+            "poses.bvh         holds the longest stretch of poses, 20 frames from 7 on; 10 poses are outside"
+            in lines
+        )
+        assert not any(line.startswith("poses_2.bvh") for line in lines)
+        assert lines[-1].startswith(f"results           {tmp_path}/ poses.{{bvh,csv}}, person.yaml")
 
     def test_nothing_is_asked_for(self, body: BodyModel, size: torch.Tensor, tmp_path: Path) -> None:
         assert export_motion(tmp_path, "", moving(body, size), body, size, ExportConfig(formats=())) == {}

@@ -37,7 +37,11 @@ class _Node:
 
 
 def write_bvh(
-    path: Path, sequence: PoseSequence, body: BodyModel, size: Float[Tensor, "1 sizes"], gap: float = GAP
+    path: str | Path,
+    sequence: PoseSequence,
+    body: BodyModel,
+    size: Float[Tensor, "1 sizes"],
+    gap: float = GAP,
 ) -> PoseSequence:
     """Write the longest stretch of poses as BVH, which has no missing frames: no old pose shall stand for a new one.
 
@@ -76,7 +80,7 @@ def write_bvh(
     table = np.hstack([place, *(still if node.body is None else next(fixed) for node in order)])
     row = " ".join(["%.5f"] * table.shape[1])
     lines += [row % tuple(values) for values in table.tolist()]
-    with replacing(path) as partial:
+    with replacing(Path(path)) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
     return steady
 

@@ -21,7 +21,7 @@ def check_c3d() -> None:
         )
 
 
-def write_c3d(path: Path, sequence: PoseSequence) -> None:
+def write_c3d(path: str | Path, sequence: PoseSequence) -> None:
     """Write the fifteen joint centres as points: mm, OpenSim's axes (y up), the camera's constant rate.
 
     A frame without a pose, or one that was dropped, has residual -1, which means that nothing was measured.
@@ -47,5 +47,5 @@ def write_c3d(path: Path, sequence: PoseSequence) -> None:
     whole = np.concatenate([points, np.ones_like(points[:1])])
     file["data"]["points"] = np.where(missing, 0.0, whole)
     file["data"]["meta_points"]["residuals"] = np.where(missing, -1.0, 0.0)
-    with replacing(path) as partial:
+    with replacing(Path(path)) as partial:
         file.write(str(partial))

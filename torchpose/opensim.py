@@ -70,7 +70,7 @@ def to_opensim(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     return -points.flip(-1)
 
 
-def write_mot(path: Path, sequence: PoseSequence) -> None:
+def write_mot(path: str | Path, sequence: PoseSequence) -> None:
     """Write OpenSim coordinates over time: degrees, metres, seconds; a row for each frame with a pose, and no others.
 
     OpenSim's `.mot` knows no missing number, so a frame without a pose has no row, and its time is missing. Angles run
@@ -118,9 +118,9 @@ def write_mot(path: Path, sequence: PoseSequence) -> None:
     _write(path, [*head, *(row % tuple(values) for values in table.tolist())])
 
 
-def write_trc(path: Path, sequence: PoseSequence) -> None:
+def write_trc(path: str | Path, sequence: PoseSequence) -> None:
     """Write the fifteen joint centres as markers, mm; without a pose they are NaN, which OpenSim reads as missing."""
-    clean = sequence.without_stale_numbers()
+    path, clean = Path(path), sequence.without_stale_numbers()
     rate, names = frame_rate(clean), [MARKERS[joint] for joint in JOINT_NAMES]
     points = _MM * to_opensim(clean.joints).flatten(1).numpy()
     first = int(clean.frame[0]) if len(clean) else 0
@@ -153,6 +153,6 @@ def _pelvis(sequence: PoseSequence, column: dict[str, np.ndarray]) -> tuple[np.n
     return torch.stack([tilt, bow, turn], -1).numpy(), place.numpy()
 
 
-def _write(path: Path, lines: list[str]) -> None:
-    with replacing(path) as partial:
+def _write(path: str | Path, lines: list[str]) -> None:
+    with replacing(Path(path)) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
