@@ -39,7 +39,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> File:
 @pytest.fixture(scope="module")
 def result(folder: File, tmp_path_factory: pytest.TempPathFactory) -> File:
     output = tmp_path_factory.mktemp("result")
-    (output / "poses_3.csv").write_text("an earlier run found a third one")
+    for name in ("poses_3.csv", "poses_3.bvh"):
+        (output / name).write_text("an earlier run found a third one")
     assert infer_main([f"recording={folder}", f"output={output}", *QUICK]) == 0
     return output
 
@@ -54,6 +55,7 @@ def test_each_has_files_of_their_own_and_nothing_stale_stays(result: File):
     assert names == {
         *("poses.csv", "poses.npz", "angles.png", "person.yaml"),
         *("poses_2.csv", "poses_2.npz", "angles_2.png", "person_2.yaml"),
+        *(f"poses{mark}.{kind}" for mark in ("", "_2") for kind in ("mot", "trc", "bvh")),
         *("overlay.mp4", "summary.json"),
     }
     others = json.loads((result / "summary.json").read_text())["others"]

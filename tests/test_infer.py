@@ -58,7 +58,10 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_every_file_is_there_and_nothing_else(result: Path):
     names = {path.name for path in result.iterdir()}
-    assert names == {"poses.csv", "poses.npz", "person.yaml", "overlay.mp4", "angles.png", "summary.json"}
+    assert names == {
+        *("poses.csv", "poses.npz", "poses.mot", "poses.trc", "poses.bvh"),
+        *("person.yaml", "overlay.mp4", "angles.png", "summary.json"),
+    }
 
 
 def test_the_table_has_the_contract_s_columns_and_a_row_a_frame(result: Path):
@@ -112,6 +115,28 @@ def test_full_precision_agrees_with_the_table(result: Path):
     torch.testing.assert_close(table.angles, full.angles, atol=2e-4, rtol=0, equal_nan=True)  # 0.01 degree
     sd = full.angle_sd[torch.tensor(full.answered)]
     assert ((sd > 0) & (sd <= torch.pi)).all()
+
+
+def test_motion_is_written_for_other_programs_and_old_files_go(folder: Path, tmp_path: Path):
+    """One frame, filtered; a BVH of a second person and a C3D are left by an earlier run."""
+    for old in ("poses_2.bvh", "poses.c3d", "poses_2_filtered.csv"):
+        (tmp_path / old).write_text("old")
+    command = [f"recording={folder}", f"output={tmp_path}", "max_frames=1", *QUICK]
+    assert infer_main([*command, "export.formats=[mot,bvh]", "export.filter=rts"]) == 0
+    names = {path.name for path in tmp_path.glob("poses*")}
+    assert names == {"poses.csv", "poses.npz", "poses_filtered.csv", "poses.mot", "poses.bvh"}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["bvh"] == {"poses.bvh": {"first_frame": 0, "frames": 1, "left_out": 0}}
+    assert summary["settings"]["export"]["formats"] == ["mot", "bvh"]
+
+
+def test_a_filter_that_the_camera_is_too_slow_for_is_said_at_once(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    command = [f"recording={folder}", f"output={tmp_path / 'out'}", "export.filter=butterworth", *QUICK]
+    assert infer_main(command) == 2
+    assert "export.cutoff must be below half of the 10 frames a second, got 6 Hz" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def interrupted_at(last: int) -> Callable[..., object]:

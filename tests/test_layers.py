@@ -77,21 +77,9 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "learning": ("part_network", "training"),
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
-        *("export", "figures", "timeline", "journal", "activities"),
-        *(
-            "eyes",
-            "pipeline",
-            "window",
-            "people",
-            "parts",
-            "overlay",
-            "session",
-            "web_view",
-            "live",
-            "clips",
-            "study",
-            "cli",
-        ),
+        *("export", "trajectory_filter", "resampling", "opensim", "bvh", "c3d_file", "motion_export"),
+        *("figures", "timeline", "journal", "activities", "eyes", "pipeline", "window", "people"),
+        *("parts", "overlay", "session", "web_view", "live", "clips", "study", "cli"),
     ),
 }
 ORDER = [
@@ -106,7 +94,7 @@ FORBIDDEN = {
     )
 }
 # Slow or optional: imported where they are used.
-NOT_AT_TOP = {"matplotlib", "pytorch_kinematics", "rerun", "ray", "tensorboard"}
+NOT_AT_TOP = {"matplotlib", "pytorch_kinematics", "rerun", "ray", "tensorboard", "ezc3d"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -5,16 +5,22 @@ from torchpose.activity.recognizer import Recognizer, RecognizerConfig
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, limb_angles
 from torchpose.body.ellipsoid import algebraic_distance, foot_point, nearest_point
 from torchpose.body.model import BodyConfig, BodyModel, PosedBody
+from torchpose.bvh import write_bvh
+from torchpose.c3d_file import write_c3d
 from torchpose.export import PoseSequence, read_poses_csv, read_poses_npz
 from torchpose.eyes import Eyes, EyesConfig
 from torchpose.least_squares import LMConfig, levenberg_marquardt
+from torchpose.motion_export import ExportConfig
+from torchpose.opensim import write_mot, write_trc
 from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Frame, Recording, open_recording, write_recording
 from torchpose.registration.likelihood import Evidence, PartLikelihood
+from torchpose.registration.size import read_size
 from torchpose.registration.vem import Observation, Registrar, RegistrationConfig
 from torchpose.rendered import demo_recording
 from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
+from torchpose.trajectory_filter import FilterKind, filter_sequence
 from torchpose.version import __version__
 from torchpose.vision.background import BackgroundModel, DepthBackground
 from torchpose.vision.camera import RawStereo, StereoCamera
@@ -36,10 +42,12 @@ __all__ = [
     "DepthBackground",
     "Disparity",
     "Evidence",
+    "ExportConfig",
     "Eyes",
     "EyesConfig",
     "FaceDetector",
     "Faces",
+    "FilterKind",
     "Frame",
     "GrowingSeeds",
     "GrowingSeedsConfig",
@@ -71,6 +79,7 @@ __all__ = [
     "algebraic_distance",
     "anatomical_angles",
     "demo_recording",
+    "filter_sequence",
     "foot_point",
     "group_cells",
     "levenberg_marquardt",
@@ -80,8 +89,13 @@ __all__ = [
     "person_silhouette",
     "read_poses_csv",
     "read_poses_npz",
+    "read_size",
     "read_skeletons",
     "sample_grid",
     "stereo_matcher",
+    "write_bvh",
+    "write_c3d",
+    "write_mot",
     "write_recording",
+    "write_trc",
 ]

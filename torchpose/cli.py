@@ -29,6 +29,7 @@ from torchpose.clips import ClipMaker, DataConfig, build_database
 from torchpose.eyes import EyesConfig
 from torchpose.live import LiveConfig, LiveRun
 from torchpose.manual import full_help, short_help
+from torchpose.motion_export import ExportConfig
 from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
@@ -81,6 +82,7 @@ class InferConfig:
     pose: PoseConfig = field(default_factory=PoseConfig)
     people: PeopleConfig = field(default_factory=PeopleConfig)
     live: LiveConfig = field(default_factory=LiveConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
     recognizer: str | None = (
         None  # folder of a trained one, runs/train/recognizers/angles: writes activities.csv
     )
@@ -219,7 +221,8 @@ def infer(config: InferConfig, device: torch.device) -> None:
 
     def session_of(recording: Recording, rows_before: float | None) -> Session:
         model = StereoToPose(recording.camera, config.eyes, pose).to(device)
-        return Session(People(model, config.people), recording, output, settings, __version__, rows_before)
+        people = People(model, config.people)
+        return Session(people, recording, output, settings, __version__, rows_before, config.export)
 
     if camera is not None and live:
         summary = _follow_live(config, camera, output, session_of)

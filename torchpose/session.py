@@ -8,6 +8,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import sys
 import time
@@ -32,6 +33,7 @@ from torchpose.export import (
 )
 from torchpose.eyes import depth_picture
 from torchpose.figures import draw_overlay, plot_angles
+from torchpose.motion_export import ExportConfig, ExportFormat, export_motion
 from torchpose.overlay import overlays
 from torchpose.parts import LabelledPoints, Parts, PersonParts
 from torchpose.people import People
@@ -49,6 +51,10 @@ _PARTS, _FILES = "parts", "files"  # folders of a run that is not finished
 _DRAWN = 50  # frames whose outlines are computed at once
 _SAME_RATE = 0.01  # relative
 _MOST_PROBLEMS = 4  # that are printed
+# Files that a run may write or not: those of people, by number, and in chosen formats.
+_OURS = re.compile(
+    rf"(poses|angles|person)(_\d+)?(_filtered)?\.(csv|npz|png|yaml|{'|'.join(kind.value for kind in ExportFormat)})"
+)
 
 
 class Session:
@@ -66,10 +72,13 @@ class Session:
         settings: Mapping[str, Any],
         version: str,
         rows_before: float | None = None,
+        export: ExportConfig | None = None,
     ):
         self.people, self.model = people, people.model
         self.recording, self.output = recording, output
         self.settings, self.version, self.rows_before = settings, version, rows_before
+        self.export = export or ExportConfig()
+        self.export.check_rate(recording.camera.frame_rate)
         self.parts = Parts(output / _PARTS)
         self.problems: list[str] = []
         self.kept: list[dict[str, Tensor]] = []  # what an interrupted run goes on from, of each person
@@ -143,7 +152,7 @@ class Session:
         shutil.rmtree(staged, ignore_errors=True)
         found = self._found()
         with self.model.stopwatch.measure("export"):
-            self._write(found, staged)
+            notes = {**notes, "bvh": self._write(found, staged)}
         summary = self._summary(found[0].sequence, time.perf_counter() - begin, followed)
         summary["others"] = [dict(Counter(other.sequence.status)) for other in found[1:]]
         summary["files"] = sorted([*(path.name for path in staged.iterdir()), "summary.json"])
@@ -158,8 +167,12 @@ class Session:
         people = [self.parts.person(number) for number in range(self.parts.people)]
         return [one for one in people if one.number == 0 or sum(one.sequence.answered) >= FEWEST]
 
-    def _write(self, found: Sequence[PersonParts], folder: Path) -> None:
-        """Every file but the summary. A person's `sequence` has no covariances; `points(position)` are of a part."""
+    def _write(self, found: Sequence[PersonParts], folder: Path) -> dict[str, Any]:
+        """Every file but the summary, for which notes come back of files that do not hold every pose.
+
+        A person's `sequence` has no covariances; `points(position)` are of a part.
+        """
+        notes: dict[str, Any] = {}
         for number, person in enumerate(found, 1):
             mark = "" if number == 1 else f"_{number}"
             model = self.people.followers[person.number].model
@@ -167,16 +180,17 @@ class Session:
             write_poses_npz(folder / f"poses{mark}.npz", person.sequence, person.covariances())
             plot_angles(folder / f"angles{mark}.png", person.sequence)
             write_size(folder / f"person{mark}.yaml", model.body, model.size)
+            notes |= export_motion(folder, mark, person.sequence, model.body, model.size, self.export)
         self._draw(found, folder / "overlay.mp4")
+        return notes
 
     def _publish(self, staged: Path) -> None:
-        """Move the files into the output folder, and remove those of further people that an earlier run found."""
+        """Move the files into the output folder, and remove those of an earlier run that this one did not write."""
         files = sorted(staged.iterdir())
         names = {file.name for file in files}
-        for file in files:
-            for old in self.output.glob(f"{file.stem}_*{file.suffix}"):
-                if old.stem.removeprefix(f"{file.stem}_").isdigit() and old.name not in names:
-                    old.unlink()
+        for old in self.output.iterdir():
+            if _OURS.fullmatch(old.name) and old.name not in names:
+                old.unlink()
         for file in files:
             os.replace(file, self.output / file.name)
 
@@ -310,6 +324,15 @@ def summary_table(summary: Mapping[str, Any], output: Path, columns: int) -> str
         *((f"person {k}", _counted(other)) for k, other in enumerate(summary["others"], 2)),
         ("time", f"{summary['seconds']:.1f} s, {summary['seconds_per_frame']:.2f} s a frame"),
         ("CPU ms a frame", ", ".join(f"{name} {ms:.0f}" for name, ms in stages)),
+        *(
+            (
+                name,
+                f"holds the longest stretch of poses, {note['frames']} frames from {note['first_frame']} on; "
+                f"{note['left_out']} poses are outside",
+            )
+            for name, note in summary.get("bvh", {}).items()
+            if note["left_out"]
+        ),
         ("results", f"{output}/ {', '.join(summary['files'])}"),
     ]
     if "live" in summary:

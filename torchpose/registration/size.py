@@ -102,11 +102,12 @@ def write_size(path: Path, body: BodyModel, size: Float[Tensor, "1 sizes"]) -> N
         )
 
 
-def read_size(path: Path, body: BodyModel) -> Float[Tensor, "1 sizes"]:
+def read_size(path: str | Path, body: BodyModel) -> Float[Tensor, "1 sizes"]:
     """The sizes that `write_size` saved.
 
     Raises ValueError, naming the file, if it is missing, has other names than the body file or senseless numbers.
     """
+    path = Path(path)
     if not path.is_file():
         raise ValueError(
             f"the person's file must exist, got {path}; leave `pose.person` empty to measure the person"
