@@ -58,7 +58,16 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_every_file_is_there_and_nothing_else(result: Path):
     names = {path.name for path in result.iterdir()}
-    assert names == {"poses.csv", "poses.npz", "person.yaml", "overlay.mp4", "angles.png", "summary.json"}
+    files = {
+        "poses.csv",
+        "poses.npz",
+        "person.yaml",
+        "overlay.mp4",
+        "angles.png",
+        "summary.json",
+        "report.html",
+    }
+    assert names == files
 
 
 def test_the_table_has_the_contract_s_columns_and_a_row_a_frame(result: Path):
@@ -93,6 +102,7 @@ def test_the_summary_says_what_was_wrong(result: Path):
     assert summary["status"]["absent"] == summary["status"]["lost"] == 1
     assert summary["problems"] == [pytest.approx(summary["problems"][0])]
     assert f"{BROKEN:06d}.png" in summary["problems"][0]
+    assert summary["warnings"] == []
     assert summary["settings"]["pose"]["height"] == 1.75
     assert summary["version"] == tp.__version__
 

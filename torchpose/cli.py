@@ -28,7 +28,7 @@ from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
 from torchpose.scaled import at_most
-from torchpose.session import Session, is_interrupted, settings_of, summary_table
+from torchpose.session import Session, is_interrupted, kept_warnings, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups, describe
 from torchpose.study import (
     THESIS_ACCURACY,
@@ -205,6 +205,11 @@ def train_main(argv: Sequence[str]) -> int:
 
 def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
+    with kept_warnings() as told:
+        _infer(config, device, told)
+
+
+def _infer(config: InferConfig, device: torch.device, told: list[str]) -> None:
     output, settings = Path(config.output), settings_of(config)
     activities = _activities(config)
     if config.recording is None:
@@ -222,7 +227,9 @@ def infer(config: InferConfig, device: torch.device) -> None:
             rows_before = recording.alignment.typical * shrunk
     recording = at_most(recording, config.max_width)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
-    session = Session(People(model, config.people), recording, output, settings, __version__, rows_before)
+    session = Session(
+        People(model, config.people), recording, output, settings, __version__, rows_before, told
+    )
     print(summary_table(session.run(config.fresh, config.max_frames), output))
     if activities is not None:
         print(activity_lines(activities.write(output, model.body, str(output.resolve()))))

@@ -64,10 +64,10 @@ _SIGNS = {
     "abduction": "abduction +, adduction −",
     "rotation": "rotation, + inward",
 }
-_WORST_SD = np.pi / 4  # rad; an angle that is less certain says nothing, and its band would fill the panel
+WORST_SD = np.pi / 4  # rad; an angle that is less certain says nothing, and its band would fill the panel
 _NO_POSE: dict[str, Any] = {"facecolor": "0.92", "edgecolor": "0.75", "hatch": "////", "linewidth": 0}
 _PANEL_COLUMNS = 3
-_LEAST_SPAN = 20.0  # degrees from the bottom to the top of a panel, so that noise looks like noise
+LEAST_SPAN = 20.0  # degrees from the bottom to the top of a panel, so that noise looks like noise
 _SHIFT = 4  # bits behind the point in OpenCV's coordinates
 _FAR = 1e5  # px; beyond it OpenCV's coordinates would overflow
 
@@ -110,7 +110,7 @@ def plot_angles(path: Path, sequence: PoseSequence) -> None:
     from matplotlib.patches import Patch
 
     clean = sequence.without_stale_numbers()
-    panels = _panels(clean.angle_names)
+    panels = angle_panels(clean.angle_names)
     rows = -(-len(panels) // _PANEL_COLUMNS)
     figure = Figure(figsize=(11, 0.9 + 1.75 * rows), layout="constrained")
     axes = figure.subplots(rows, _PANEL_COLUMNS, squeeze=False, sharex=True).ravel()
@@ -182,7 +182,7 @@ def _draw_confusion(axes: "Axes", evaluation: Evaluation, named: bool) -> None:
     axes.tick_params(length=0)
 
 
-def _panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:
+def angle_panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:
     """The columns of each panel's lines, by side: {"neck_flexion": {"": 3}, "hip_flexion": {"left": 5}}."""
     panels: dict[str, dict[str, int]] = {}
     for column, name in enumerate(names):
@@ -192,7 +192,8 @@ def _panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:
     return panels
 
 
-def _panel_title(name: str) -> str:
+def panel_title(name: str) -> str:
+    """What a panel of `angle_panels` shows, in words, with the meaning of the sign."""
     for ending, meaning in _SIGNS.items():
         if name.endswith(ending):
             joint = name.removesuffix(ending).strip("_") or name.removesuffix("_rotation")
@@ -206,7 +207,7 @@ def _draw_panel(axes: "Axes", sequence: PoseSequence, name: str, columns: dict[s
     low, high = np.inf, -np.inf
     for side, column in columns.items():
         angle, sd = (np.rad2deg(values[:, column].numpy()) for values in (sequence.angles, sequence.angle_sd))
-        angle = np.where(sd > np.rad2deg(_WORST_SD), np.nan, angle)  # an unknown sd is not a large one
+        angle = np.where(sd > np.rad2deg(WORST_SD), np.nan, angle)  # an unknown sd is not a large one
         colour = _hex(colours[side])
         axes.fill_between(time, angle - 2 * sd, angle + 2 * sd, color=colour, alpha=0.2, linewidth=0)
         axes.plot(time, angle, color=colour, linewidth=1.2, marker=".", markersize=1.5)
@@ -216,12 +217,12 @@ def _draw_panel(axes: "Axes", sequence: PoseSequence, name: str, columns: dict[s
         high = max(high, angle[known].max(initial=-np.inf) + margin)
     if low > high:
         low = high = 0.0
-    half = max(_LEAST_SPAN, 1.1 * (high - low)) / 2
+    half = max(LEAST_SPAN, 1.1 * (high - low)) / 2
     axes.set_ylim((low + high) / 2 - half, (low + high) / 2 + half)
     for start, stop in _gaps(sequence):
         axes.axvspan(start, stop, **_NO_POSE, zorder=0)
     axes.axhline(0, color="0.7", linewidth=0.6, zorder=0.5)
-    axes.set_title(_panel_title(name), fontsize=9, loc="left")
+    axes.set_title(panel_title(name), fontsize=9, loc="left")
     axes.tick_params(labelsize=8)
     axes.margins(x=0)
     axes.spines[["top", "right"]].set_visible(False)

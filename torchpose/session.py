@@ -12,7 +12,8 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ from torchpose.people import People
 from torchpose.pipeline import FramePose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
 from torchpose.registration.size import write_size
+from torchpose.report import Report
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 from torchpose.window import PeopleWindows
 
@@ -60,7 +62,7 @@ class Session:
     """Runs a model over a recording into a folder. The same settings on the same recording go on where they stopped.
 
     `rows_before` is how far apart, in px of the recording's images, the rows were before they were corrected; None
-    where they were not.
+    where they were not; `told` gathers the warnings, see `kept_warnings`.
     """
 
     def __init__(
@@ -71,12 +73,14 @@ class Session:
         settings: Mapping[str, Any],
         version: str,
         rows_before: float | None = None,
+        told: list[str] | None = None,
     ):
         self.people, self.model = people, people.model
         self.recording, self.output = recording, output
         self.settings, self.version, self.rows_before = settings, version, rows_before
         self.parts = output / _PARTS
         self.problems: list[str] = []
+        self.told = [] if told is None else told
         self.kept: list[dict[str, Tensor]] = []  # what an interrupted run goes on from, of each person
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
@@ -91,6 +95,7 @@ class Session:
             self.people.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
             self._follow(done, count)
         found = self._collect()
+        report = self._report(found)
         with self.model.stopwatch.measure("export"):
             for pattern in ("poses_*.csv", "poses_*.npz", "angles_*.png", "person_*.yaml"):
                 for old in self.output.glob(pattern):  # an earlier run may have found more people
@@ -102,12 +107,13 @@ class Session:
                 plot_angles(self.output / f"angles{mark}.png", sequence)
                 size = self.people.followers[person].model.size
                 write_size(self.output / f"person{mark}.yaml", self.model.body, size)
-            self._draw(found)
+            self._draw(found, report)
         sequence = found[0][0]
         summary = self._summary(sequence, time.perf_counter() - begin, count - done)
         summary["others"] = [dict(Counter(other.status)) for other, _, _ in found[1:]]
         summary |= {"rows_apart_px": rows_apart, "rows_apart_before_px": self.rows_before}
         write_summary(self.output / "summary.json", summary)
+        report.write(self.output / "report.html", summary)
         shutil.rmtree(self.parts)
         return summary
 
@@ -186,17 +192,19 @@ class Session:
         """One part of a person: labelled points, what the next frame starts from, and last the poses."""
         folder = self._folder(person)
         num = max((f.sight.cloud.mask.shape[1] for f in frames if f.sight is not None), default=1)
-        pixels, labels = (
+        pixels, metres, labels = (
             np.full((len(frames), num, 2), np.nan, np.float32),
+            np.full((len(frames), num, 3), np.nan, np.float16),  # 2 mm at 4 m
             np.full((len(frames), num), -1, np.int8),
         )
         for i, frame in enumerate(frames):
             if frame.sight is not None and frame.registration is not None:
                 seen = frame.sight.cloud.mask[0].cpu()
                 pixels[i, seen] = frame.sight.cloud.pixels[0].cpu()[seen]
+                metres[i, seen] = frame.sight.cloud.points[0].cpu()[seen].half()
                 labels[i, seen] = frame.registration.belief[0].argmax(0).cpu()[seen]
         with replacing(folder / f"points_{end:08d}.npz") as partial:
-            np.savez(partial, pixels=pixels, labels=labels)
+            np.savez(partial, pixels=pixels, metres=metres, labels=labels)
         state = {name: value.cpu().numpy() for name, value in kept.items()}
         with replacing(folder / f"state_{end:08d}.npz") as partial:
             np.savez_compressed(partial, allow_pickle=False, **state)
@@ -240,8 +248,29 @@ class Session:
         part = np.load(file)
         return part["pixels"], part["labels"]
 
-    def _draw(self, found: list[tuple[PoseSequence, _Labelled, int]]) -> None:
-        """The overlay video, from the recording's images and the poses."""
+    def _report(self, found: list[tuple[PoseSequence, _Labelled, int]]) -> Report:
+        """The page, with everything but the pictures."""
+        title = Path(str(self.settings.get("recording") or "demo")).name
+        sizes = [self.people.followers[person].model.size for _, _, person in found]
+        report = Report(title, self.model.body, sizes, len(found[0][0]))
+        for number, (sequence, _, person) in enumerate(found):
+            report.add_poses(number, 0, sequence)
+            start = 0
+            for file in self._files():
+                end = int(file.stem.removeprefix("poses_"))
+                points = self._folder(person) / file.name.replace("poses", "points")
+                if points.exists() and any(report.wants(position) for position in range(start, end)):
+                    with np.load(points) as part:
+                        metres, labels = (torch.from_numpy(part[name]) for name in ("metres", "labels"))
+                    for position in range(start, end):
+                        report.add_points(
+                            number, position, metres[position - start].float(), labels[position - start]
+                        )
+                start = end
+        return report
+
+    def _draw(self, found: list[tuple[PoseSequence, _Labelled, int]], report: Report) -> None:
+        """The overlay video, from the recording's images and the poses, and its pictures for the page."""
         camera = self.model.camera
         with open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate) as video:
             for i in range(len(found[0][0])):
@@ -250,6 +279,7 @@ class Session:
                     if person == 0 or sequence.answered[i]:
                         image = draw_overlay(image, self._overlay(sequence, labelled, person, i))
                 video.write(image)
+                report.add_image(i, image)
 
     def _overlay(self, sequence: PoseSequence, labelled: _Labelled, person: int, i: int) -> Overlay:
         """What is drawn of a person in a frame; words of the first alone."""
@@ -309,7 +339,23 @@ class Session:
             "seconds_per_frame": seconds / max(frames, 1),
             "cpu_ms_per_frame": {name: 1000 * value / max(frames, 1) for name, value in stages.items()},
             "problems": self.problems,
+            "warnings": list(dict.fromkeys(self.told)),
         }
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """A list to which the sentences of all warnings are added that are shown while the block runs."""
+    told: list[str] = []
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def keep(message: Warning | str, *details: Any, **more: Any) -> None:
+            told.append(str(message))
+            show(message, *details, **more)
+
+        warnings.showwarning = keep
+        yield told
 
 
 def is_interrupted(output: Path, settings: Mapping[str, Any], version: str) -> bool:
@@ -340,7 +386,7 @@ def summary_table(summary: Mapping[str, Any], output: Path) -> str:
             f"person {number}          " + ", ".join(f"{count} {name}" for name, count in other.items())
             for number, other in enumerate(summary["others"], 2)
         ),
-        f"results           {output}/ poses.csv, poses.npz, person.yaml, overlay.mp4, angles.png, summary.json",
+        f"results           {output}/ report.html, poses.csv, poses.npz, person.yaml, overlay.mp4, angles.png",
     ]
     problems = summary["problems"]
     lines += [f"problem           {problem}" for problem in problems[:5]]
