@@ -54,7 +54,7 @@ def test_each_has_files_of_their_own_and_nothing_stale_stays(result: File):
     assert names == {
         *("poses.csv", "poses.npz", "angles.png", "person.yaml"),
         *("poses_2.csv", "poses_2.npz", "angles_2.png", "person_2.yaml"),
-        *("overlay.mp4", "summary.json"),
+        *("overlay.mp4", "summary.json", "report.html"),
     }
     others = json.loads((result / "summary.json").read_text())["others"]
     assert len(others) == 1

@@ -35,7 +35,7 @@ from torchpose.export import (
     write_summary,
 )
 from torchpose.eyes import depth_picture
-from torchpose.figures import Overlay, draw_overlay, plot_angles
+from torchpose.figures import WORST_SD, Overlay, draw_overlay, plot_angles
 from torchpose.people import People
 from torchpose.pipeline import FramePose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
@@ -275,30 +275,36 @@ class Session:
         with open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate) as video:
             for i in range(len(found[0][0])):
                 image = self._image(i)
-                for sequence, labelled, person in found:
-                    if person == 0 or sequence.answered[i]:
-                        image = draw_overlay(image, self._overlay(sequence, labelled, person, i))
+                for number, (sequence, labelled, person) in enumerate(found):
+                    row = number if len(found) > 1 else -1
+                    image = draw_overlay(image, self._overlay(sequence, labelled, person, i, row))
                 video.write(image)
                 report.add_image(i, image)
 
-    def _overlay(self, sequence: PoseSequence, labelled: _Labelled, person: int, i: int) -> Overlay:
-        """What is drawn of a person in a frame; words of the first alone."""
+    def _overlay(self, sequence: PoseSequence, labelled: _Labelled, person: int, i: int, row: int) -> Overlay:
+        """What is drawn of a person in a frame. `row` is the person's among the written statuses, -1 alone."""
         camera, body, size = self.model.camera, self.model.body, self.people.followers[person].model.size
         assert sequence.pose is not None
-        status = sequence.status[i] if person == 0 else ""
+        name, row = (str(row + 1), row) if row >= 0 else ("", 0)
+        status = f"{name} {sequence.status[i]}".strip()
         if not bool(sequence.pose[i].isfinite().all()):
-            return Overlay(status)
+            return Overlay(status, row=row)
         posed = body(sequence.pose[i : i + 1].to(size), size)
-        shown = [sequence.angle_names.index(name) for name in _SHOWN]
-        angles = sequence.angles[i, shown].rad2deg().round().int().tolist()
-        lines = (f"elbow L {angles[0]}  R {angles[1]}", f"knee  L {angles[2]}  R {angles[3]}")
+        marks = []
+        for angle in _SHOWN:
+            joint, side = angle.split("_flexion_")
+            column = sequence.angle_names.index(angle)
+            if not float(sequence.angle_sd[i, column]) > WORST_SD:
+                marks.append((f"{joint}_{side}", f"{math.degrees(sequence.angles[i, column]):.0f}"))
         return Overlay(
             status,
             camera.project(outline(posed))[0].cpu(),
             camera.project(posed.joints)[0].cpu(),
             labelled.pixels[i],
             labelled.labels[i],
-            lines if person == 0 else (),
+            row=row,
+            name=name,
+            marks=tuple(marks),
         )
 
     def _image(self, position: int) -> Float[Tensor, "3 height width"]:

@@ -259,7 +259,7 @@
     entry(`height:3px;background:${css(RIGHT)}`, "right");
     entry("background:repeating-linear-gradient(135deg,#ebebeb 0 3px,#bdbdbd 3px 4px)", "no pose");
     entry(`height:3px;background:${css(MIDDLE)}`, "trunk, neck");
-    entry(`background:${styles.find((s) => s.name === "partial").tint}`, "partial or recovered");
+    entry("background:linear-gradient(90deg,rgba(240,228,66,.3) 50%,rgba(86,180,233,.3) 50%)", "status, as below");
     key.append(make("div", { class: "wide" }, `Degrees. Left and right are the person's. What is less certain than ± ${Math.round(2 * data.worst_sd)}° is left out.`));
     element("plots").append(key);
   }
@@ -294,6 +294,7 @@
       panel.plot.setLines(panel.series);
     }
     if (following) frameScene();
+    tellFacts();
     drawPlots();
   }
 
@@ -526,13 +527,19 @@
   const summary = data.summary;
   const number = (value, digits = 1) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
-  function setUpWords() {
-    const counts = Object.entries(summary.status || {}).map(([name, n]) => `${n} ${name}`).join(", ");
-    const off = summary.point_to_model_m && summary.point_to_model_m.mean !== null ? `${number(1000 * summary.point_to_model_m.mean)} mm` : "–";
+  const inMillimetres = (metres) => (metres === null ? "–" : number(1000 * metres));
+  const inWords = (counts) => Object.entries(counts || {}).map(([name, n]) => `${n} ${name}`).join(", ");
+  const countsOf = (index) => inWords(index === 0 ? summary.status : (summary.others || [])[index - 1]);
+
+  function tellFacts() {
     const seconds = count ? time[count - 1] - time[0] : 0;
-    for (const [value, text] of [[`${data.count}`, ` frames, ${number(seconds)} s`], ["", counts], [off, " points to model"]]) {
-      if (value || text) element("facts").append(make("li", {}, make("b", {}, value), text));
-    }
+    const known = count ? people[person].distance.filter((value) => value === value) : [];
+    const off = known.length ? `${number((1000 * known.reduce((sum, value) => sum + value, 0)) / known.length)} mm` : "–";
+    const facts = [[`${data.count}`, ` frames, ${number(seconds)} s`], ["", countsOf(person)], [off, " points to model"]];
+    element("facts").replaceChildren(...facts.map(([value, text]) => make("li", {}, make("b", {}, value), text)));
+  }
+
+  function setUpWords() {
     if (people.length > 1) {
       people.forEach((_, i) => element("who").append(make("button", { type: "button", "aria-pressed": "false", onclick: () => choosePerson(i) }, `person ${i + 1}`)));
     }
@@ -549,7 +556,7 @@
       if (more.length) element("notes").append(make("details", { ontoggle: layOut }, make("summary", {}, `and ${more.length} more`), make("ul", {}, ...more)));
       element("notes").hidden = false;
     }
-    setUpAbout(counts, off);
+    setUpAbout();
   }
 
   function table(rows) {
@@ -562,18 +569,18 @@
     return Object.entries(value).flatMap(([name, item]) => flat(item, prefix ? `${prefix}.${name}` : name));
   }
 
-  function setUpAbout(counts, off) {
+  function setUpAbout() {
     const versions = Object.entries(summary.versions || {}).map(([name, version]) => `${name} ${version}`).join(", ");
     const block = (title, ...children) => element("about").append(make("div", {}, make("h2", {}, title), ...children));
     block("This run", table([
-      ["frames", data.count], ["status", counts || "–"], ["with a pose", `${number(100 * (summary.answered || 0))} %`],
-      ["points to model, mean ± sd", summary.point_to_model_m ? `${off} ± ${summary.point_to_model_m.sd === null ? "–" : number(1000 * summary.point_to_model_m.sd)}` : "–"],
-      ...(summary.others || []).map((other, i) => [`status of person ${i + 2}`, Object.entries(other).map(([name, n]) => `${n} ${name}`).join(", ")]),
+      ["frames", data.count], ["status", countsOf(0) || "–"], ["with a pose", `${number(100 * (summary.answered || 0))} %`],
+      ["points to model, mean ± sd", summary.point_to_model_m ? `${inMillimetres(summary.point_to_model_m.mean)} ± ${inMillimetres(summary.point_to_model_m.sd)} mm` : "–"],
+      ...(summary.others || []).map((_, i) => [`status of person ${i + 2}`, countsOf(i + 1)]),
       ["rows of left and right images apart", summary.rows_apart_px === null || summary.rows_apart_px === undefined ? "–" : `${number(summary.rows_apart_px, 2)} px`],
       ["time taken", `${number(summary.seconds)} s, ${number(summary.seconds_per_frame, 2)} s a frame`],
       ["torchpose", summary.version || "–"], ["with", versions || "–"],
     ]));
-    block("Size of the person", make("p", { class: "quiet" }, "Lengths and girths as a share of the body file's own."),
+    block(people.length > 1 ? "Size of person 1" : "Size of the person", make("p", { class: "quiet" }, "Lengths and girths as a share of the body file's own."),
       table(Object.entries(summary.size || {}).map(([name, share]) => [name.replaceAll("_", " "), `${number(100 * share)} %`])));
     const key = (name) => make("kbd", {}, name);
     const line = (...children) => make("li", {}, ...children);

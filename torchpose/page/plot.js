@@ -160,10 +160,13 @@ class Plot {
   drawLine(context, { values, sd, colour }, time, first, last, x, y, width) {
     const thick = last - first > 2 * width;
     const rows = [];
-    let column = null;
+    let column = null, before = NaN;
     for (let i = Math.max(first - 1, 0); i <= Math.min(last + 1, time.length - 1); i++) {
       const value = values[i], reach = sd[i] === sd[i] ? 2 * sd[i] : 0, at = x(time[i]);
-      if (value !== value) { rows.push(null); column = null; continue; }
+      // A step of more than half a turn goes round the circle: nothing is drawn across the panel for it.
+      if (value !== value || Math.abs(value - before) > 180) { rows.push(null); column = null; }
+      before = value;
+      if (value !== value) continue;
       const row = { x: thick ? Math.floor(at) + 0.5 : at, low: value, high: value, bottom: value - reach, top: value + reach };
       if (thick && column && column.x === row.x) {
         column.low = Math.min(column.low, row.low); column.high = Math.max(column.high, row.high);
