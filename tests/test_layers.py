@@ -68,7 +68,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "learning": ("part_network", "training"),
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
-        *("export", "figures", "timeline", "journal", "report", "activities"),
+        *("export", "figures", "timeline", "journal", "report", "rerun_log", "activities"),
         *("eyes", "pipeline", "window", "people", "session", "clips", "study", "cli"),
     ),
 }

@@ -27,6 +27,7 @@ from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
+from torchpose.rerun_log import check_rerun
 from torchpose.scaled import at_most
 from torchpose.session import Session, is_interrupted, kept_warnings, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups, describe
@@ -64,6 +65,7 @@ class InferConfig:
     max_width: int = 800  # px; wider images are shrunk as they are read, and are matched much faster
     align: bool = True  # move the right images' rows onto the left's where they are more than 0.25 px apart
     fresh: bool = False  # start over instead of continuing an interrupted run
+    viz: bool = False  # write poses.rrd for the Rerun viewer, too; needs the extra viz
     seed: int = 0  # the same seed gives the same results
     device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
     threads: int = 1  # of the processor; more help only where cores are idle
@@ -99,6 +101,8 @@ class InferConfig:
                 f"max_width must be at least 64 px, got {self.max_width}; 640 to 1280 make sense"
             )
         self._check_journal()
+        if self.viz:
+            check_rerun()
         _check_machine(self.seed, self.threads)
 
     def _check_journal(self) -> None:
@@ -228,7 +232,7 @@ def _infer(config: InferConfig, device: torch.device, told: list[str]) -> None:
     recording = at_most(recording, config.max_width)
     model = StereoToPose(recording.camera, config.eyes, config.pose).to(device)
     session = Session(
-        People(model, config.people), recording, output, settings, __version__, rows_before, told
+        People(model, config.people), recording, output, settings, __version__, rows_before, told, config.viz
     )
     print(summary_table(session.run(config.fresh, config.max_frames), output))
     if activities is not None:

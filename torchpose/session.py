@@ -11,9 +11,10 @@ import shutil
 import sys
 import time
 import warnings
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ from torchpose.pipeline import FramePose
 from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
 from torchpose.registration.size import write_size
 from torchpose.report import Report
+from torchpose.rerun_log import RerunLog, depth_png, open_rerun_log
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 from torchpose.window import PeopleWindows
 
@@ -62,7 +64,8 @@ class Session:
     """Runs a model over a recording into a folder. The same settings on the same recording go on where they stopped.
 
     `rows_before` is how far apart, in px of the recording's images, the rows were before they were corrected; None
-    where they were not; `told` gathers the warnings, see `kept_warnings`.
+    where they were not; `told` gathers the warnings, see `kept_warnings`; `viz` writes
+    `poses.rrd`, too.
     """
 
     def __init__(
@@ -74,6 +77,7 @@ class Session:
         version: str,
         rows_before: float | None = None,
         told: list[str] | None = None,
+        viz: bool = False,
     ):
         self.people, self.model = people, people.model
         self.recording, self.output = recording, output
@@ -81,6 +85,9 @@ class Session:
         self.parts = output / _PARTS
         self.problems: list[str] = []
         self.told = [] if told is None else told
+        self.viz = viz
+        self._open: dict[tuple[Path, str], tuple[Path, dict[str, np.ndarray] | None]] = {}  # being read
+        self._ends: list[int] = []  # one beyond the last frame of each part
         self.kept: list[dict[str, Tensor]] = []  # what an interrupted run goes on from, of each person
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
@@ -94,10 +101,11 @@ class Session:
         if done < count:
             self.people.prepare(self.recording) if done == 0 else self.model.learn_background(self.recording)
             self._follow(done, count)
+        self._ends = [int(file.stem.removeprefix("poses_")) for file in self._files()]
         found = self._collect()
         report = self._report(found)
         with self.model.stopwatch.measure("export"):
-            for pattern in ("poses_*.csv", "poses_*.npz", "angles_*.png", "person_*.yaml"):
+            for pattern in ("poses_*.csv", "poses_*.npz", "angles_*.png", "person_*.yaml", "*.rrd"):
                 for old in self.output.glob(pattern):  # an earlier run may have found more people
                     old.unlink()
             for number, (sequence, _, person) in enumerate(found, 1):
@@ -205,6 +213,10 @@ class Session:
                 labels[i, seen] = frame.registration.belief[0].argmax(0).cpu()[seen]
         with replacing(folder / f"points_{end:08d}.npz") as partial:
             np.savez(partial, pixels=pixels, metres=metres, labels=labels)
+        if self.viz and person == 0:
+            pngs = [np.zeros(0, np.uint8) if f.sight is None else depth_png(f.sight.depth[0]) for f in frames]
+            with replacing(folder / f"depth_{end:08d}.npz") as partial:
+                np.savez(partial, *pngs)
         state = {name: value.cpu().numpy() for name, value in kept.items()}
         with replacing(folder / f"state_{end:08d}.npz") as partial:
             np.savez_compressed(partial, allow_pickle=False, **state)
@@ -255,31 +267,69 @@ class Session:
         report = Report(title, self.model.body, sizes, len(found[0][0]))
         for number, (sequence, _, person) in enumerate(found):
             report.add_poses(number, 0, sequence)
-            start = 0
-            for file in self._files():
-                end = int(file.stem.removeprefix("poses_"))
-                points = self._folder(person) / file.name.replace("poses", "points")
-                if points.exists() and any(report.wants(position) for position in range(start, end)):
-                    with np.load(points) as part:
-                        metres, labels = (torch.from_numpy(part[name]) for name in ("metres", "labels"))
-                    for position in range(start, end):
-                        report.add_points(
-                            number, position, metres[position - start].float(), labels[position - start]
-                        )
-                start = end
+            for position in report.shown.tolist():
+                report.add_points(number, position, *self._metres(person, position))
         return report
 
+    def _metres(self, person: int, position: int) -> tuple[Float[Tensor, "num 3"], Int[Tensor, " num"]]:
+        """The points of a person in a frame, m, and the parts they belong to."""
+        part, row = self._part(self._folder(person), "points", position)
+        if part is None:
+            return torch.zeros(0, 3), torch.zeros(0, dtype=torch.int8)
+        return torch.from_numpy(part["metres"][row]).float(), torch.from_numpy(part["labels"][row])
+
+    def _part(self, folder: Path, kind: str, position: int) -> tuple[dict[str, np.ndarray] | None, int]:
+        """The arrays of the part that has a frame, and the frame's row; the last of each folder and kind are kept."""
+        place = bisect_right(self._ends, position)
+        start, end = self._ends[place - 1] if place else 0, self._ends[place]
+        path = folder / f"{kind}_{end:08d}.npz"
+        if self._open.get((folder, kind), (None, None))[0] != path:
+            arrays = None
+            if path.exists():
+                with np.load(path) as part:
+                    arrays = {name: part[name] for name in part.files}
+            self._open[folder, kind] = (path, arrays)
+        return self._open[folder, kind][1], position - start
+
     def _draw(self, found: list[tuple[PoseSequence, _Labelled, int]], report: Report) -> None:
-        """The overlay video, from the recording's images and the poses, and its pictures for the page."""
-        camera = self.model.camera
-        with open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate) as video:
-            for i in range(len(found[0][0])):
+        """What needs the recording's images: overlay video, the page's pictures, and the log for Rerun."""
+        camera, first = self.model.camera, found[0][0]
+        sizes = [self.people.followers[person].model.size for _, _, person in found]
+        with ExitStack() as stack:
+            video = stack.enter_context(
+                open_video(self.output / "overlay.mp4", camera.width, camera.height, camera.frame_rate)
+            )
+            log = None
+            if self.viz:
+                log = stack.enter_context(
+                    open_rerun_log(self.output / "poses.rrd", self.model.body, camera, sizes)
+                )
+                for number, (sequence, _, _) in enumerate(found):
+                    log.add_angles(number, sequence)
+            for i in range(len(first)):
                 image = self._image(i)
+                if log is not None:
+                    log.at(int(first.frame[i]), float(first.time_s[i]))
+                    self._log(log, found, image, i)
                 for number, (sequence, labelled, person) in enumerate(found):
                     row = number if len(found) > 1 else -1
                     image = draw_overlay(image, self._overlay(sequence, labelled, person, i, row))
                 video.write(image)
                 report.add_image(i, image)
+
+    def _log(
+        self,
+        log: RerunLog,
+        found: list[tuple[PoseSequence, _Labelled, int]],
+        image: Float[Tensor, "3 height width"],
+        i: int,
+    ) -> None:
+        log.add_image(image)
+        pngs, row = self._part(self.parts, "depth", i)
+        log.add_depth(np.zeros(0, np.uint8) if pngs is None else pngs[f"arr_{row}"])
+        for number, (sequence, _, person) in enumerate(found):
+            assert sequence.pose is not None
+            log.add_person(number, sequence.status[i], sequence.pose[i], *self._metres(person, i))
 
     def _overlay(self, sequence: PoseSequence, labelled: _Labelled, person: int, i: int, row: int) -> Overlay:
         """What is drawn of a person in a frame. `row` is the person's among the written statuses, -1 alone."""
