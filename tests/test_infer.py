@@ -223,6 +223,9 @@ def test_a_side_by_side_video_s_poses_are_right_and_its_other_frame_rate_is_said
         f"warning: {path} has 12 frames a second and the calibration says 10: times are by"
     )
     assert error.count("\n") == 1
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())["warnings"]
+    assert [f"warning: {sentence}\n" for sentence in told] == [error]
+    assert "12 frames a second" in (tmp_path / "out" / "report.html").read_text()
     sequence = tp.read_poses_csv(tmp_path / "out" / "poses.csv")
     assert sequence.time_s.tolist() == [0, 0.1]
     assert all(sequence.answered)

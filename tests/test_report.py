@@ -466,6 +466,30 @@ def test_time_is_zoomed_and_played(opened: Any, tmp_path: Path, body: BodyModel)
     assert frame_of(page) == 49
 
 
+def test_a_long_run_starts_with_a_stretch_and_says_which_frames_have_pictures(
+    opened: Any, tmp_path: Path, body: BodyModel
+):
+    poses = make_poses(body, 2000)  # 100 s
+    report = Report("long", body, [body.default_size(1)], 2000)
+    report.add_poses(0, 0, poses)
+    for i in report.shown.tolist():
+        report.add_image(i, torch.rand(3, 24, 32))
+    report.write(tmp_path / "report.html", SUMMARY)
+    page = opened(tmp_path / "report.html")
+    assert page.inner_text("#shown") == "20 of 100 s"
+    page.keyboard.press("ArrowRight")
+    assert "the nearest of 200 with a picture" in page.inner_text("#image-caption")
+    views, plots = (page.locator(name).bounding_box() for name in ("#views", "#plots"))
+    assert views["x"] + views["width"] <= plots["x"]
+    page.keyboard.press("PageDown")
+    assert frame_of(page) == 10 + report.shown[1]
+    assert "nearest" not in page.inner_text("#image-caption")
+    page.keyboard.press("End")  # the stretch goes along
+    left, right = (page.locator(f".plot >> nth=0 >> {name}").bounding_box() for name in ("canvas", ".cursor"))
+    assert left["x"] < right["x"] <= left["x"] + left["width"]
+    assert "Pictures and points of 200 of 2,000 frames are on this page" in page.inner_text("#about")
+
+
 def test_everything_that_matters_is_on_the_first_screen(opened: Any, tmp_path: Path, body: BodyModel):
     people = [make_poses(body, 6, aside=aside) for aside in (0.0, 1.0)]
     summary = SUMMARY | {
@@ -483,6 +507,8 @@ def test_everything_that_matters_is_on_the_first_screen(opened: Any, tmp_path: P
     assert page.locator("#scene").bounding_box()["height"] > 180
     assert page.locator(".plot").first.bounding_box()["height"] > 60
     assert page.evaluate("() => document.documentElement.scrollWidth") == 1280
+    places = [page.locator(name).bounding_box() for name in ("#views", "#plots")]
+    assert places[0]["x"] + places[0]["width"] <= places[1]["x"]
     assert "warning 0, look at it" in page.inner_text("#notes")
     page.click("#notes summary")
     assert "frame 4: damaged" in page.inner_text("#notes")

@@ -52,7 +52,12 @@
     edges[count] = time[count - 1] + half[1];
   }
 
-  let cursor = 0, person = 0, span = [edges[0], edges[count]], playing = null;
+  // A long run begins with a stretch in which single movements can be seen.
+  const LONG = 60, STRETCH = 20; // s
+  const beginning = edges[count] - edges[0] > LONG ? edges[0] + STRETCH : edges[count];
+  let cursor = 0, person = 0, span = [edges[0], beginning], playing = null;
+
+  const summary = data.summary;
 
   // ---- looking things up ----
 
@@ -300,9 +305,11 @@
 
   function drawPlots() {
     if (!count) return;
+    const length = span[1] - span[0], whole = edges[count] - edges[0];
+    element("shown").textContent = length < whole - 1e-6 ? `${number(length, length < 10 ? 1 : 0)} of ${number(whole, 0)} s` : "";
     const across = new Set(panels.map((panel) => panel.canvas.getBoundingClientRect().left)).size;
     panels.forEach((panel, i) => panel.plot.draw({
-      time, edges, start: span[0], end: span[1], status: people[person].status, styles, numbers: i + across >= panels.length,
+      time, edges, start: span[0], end: span[1], total: edges[count], status: people[person].status, styles, numbers: i + across >= panels.length,
     }));
     update();
   }
@@ -373,14 +380,14 @@
       }
       top += track.height + GAP;
     }
-    const marks = ticks(edges[0], edges[count], width / 80);
+    const marks = timeTicks(edges[0], edges[count], width / 90), unit = edges[count] < 120 ? " s" : "";
     context.font = "10px system-ui, sans-serif";
     context.fillStyle = "#57606a";
     context.textBaseline = "alphabetic";
     for (const t of marks.found) {
       context.fillRect(Math.round(x(t)), top - 1, 1, 3);
       context.textAlign = x(t) < 12 ? "left" : x(t) > width - 12 ? "right" : "center";
-      context.fillText(clock(t, marks.step) + (edges[count] < 600 ? " s" : ""), x(t), height - 2);
+      context.fillText(clock(t, marks.step, edges[count]) + unit, x(t), height - 2);
     }
     if (span[0] > edges[0] || span[1] < edges[count]) {
       context.fillStyle = "rgba(255,255,255,.6)";
@@ -502,6 +509,7 @@
       element("speed").append(make("option", { value: speed, ...(speed === 1 ? { selected: "" } : {}) }, `${speed} ×`));
     }
     element("speed").addEventListener("change", () => { if (playing) playing = { since: performance.now(), from: time[cursor] }; });
+    element("zoom").append(make("span", { class: "quiet", id: "shown" }));
     for (const [text, title, action] of [["−", "Show more time (-)", () => zoomTime(2)], ["+", "Show less time (+, or ctrl-wheel on a plot)", () => zoomTime(0.5)], ["all", "Show the whole run (0)", () => zoomTime(Infinity)]]) {
       element("zoom").append(make("button", { type: "button", title, "aria-label": title, onclick: action }, text));
     }
@@ -524,7 +532,6 @@
 
   // ---- words ----
 
-  const summary = data.summary;
   const number = (value, digits = 1) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
   const inMillimetres = (metres) => (metres === null ? "–" : number(1000 * metres));

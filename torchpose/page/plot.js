@@ -13,11 +13,25 @@ function ticks(low, high, most) {
   return { step, found };
 }
 
-function clock(seconds, step) {
-  const digits = step >= 1 ? 0 : Math.min(Math.ceil(-Math.log10(step)), 3);
-  if (seconds < 600 && step < 60) return seconds.toFixed(digits);
-  const whole = Math.floor(seconds / 60), rest = (seconds - 60 * whole).toFixed(digits);
-  return `${whole}:${rest.padStart(digits ? digits + 3 : 2, "0")}`;
+// Round times; from two minutes on in minutes, and in hours.
+const ROUND = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 43200, 86400];
+function timeTicks(low, high, most) {
+  const step = ROUND.find((s) => s >= (high - low) / Math.max(most, 1));
+  if (high - low < 4 || !step) return ticks(low, high, most);
+  const found = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9; k++) found.push(k * step);
+  return { step, found };
+}
+
+const unitOf = (total) => (total < 120 ? "s" : total < 3600 ? "min:s" : "h:min:s");
+
+// A time in the unit of a whole run that takes `total` s.
+function clock(seconds, step, total) {
+  const digits = step >= 1 ? 0 : Math.min(Math.ceil(-Math.log10(step) - 1e-9), 3);
+  if (total < 120) return seconds.toFixed(digits);
+  const whole = Math.floor(seconds / 60 + 1e-9), pad = (value) => String(value).padStart(2, "0");
+  const rest = (seconds - 60 * whole).toFixed(digits).padStart(digits ? digits + 3 : 2, "0");
+  return total < 3600 ? `${whole}:${rest}` : `${Math.floor(whole / 60)}:${pad(whole % 60)}:${rest}`;
 }
 
 // Makes a canvas as fine as the screen; returns its context, in CSS px, and its size.
@@ -83,7 +97,7 @@ class Plot {
     this.high = (low + high) / 2 + half;
   }
 
-  // axes: {time, edges (time's borders between samples), start, end, status, styles, numbers}
+  // axes: {time, edges (time's borders between samples), start, end, total, status, styles, numbers}
   draw(axes) {
     const { context, width, height } = fresh(this.canvas);
     const box = { x: MARGIN.left, y: MARGIN.top, w: width - MARGIN.left - MARGIN.right };
@@ -114,7 +128,7 @@ class Plot {
   }
 
   drawGrid(context, axes, box, x, y) {
-    this.across = ticks(axes.start, axes.end, box.w / 55);
+    this.across = timeTicks(axes.start, axes.end, box.w / 45);
     this.up = ticks(this.low, this.high, box.h / 22);
     context.lineWidth = 1;
     for (const [values, upright] of [[this.across.found, true], [this.up.found, false]]) {
@@ -150,10 +164,10 @@ class Plot {
     context.textAlign = "center";
     for (const value of this.across.found) {
       const at = x(value);
-      if (at < box.x + box.w - 26) context.fillText(clock(value, this.across.step), Math.max(at, box.x + 3), box.y + box.h + 3);
+      if (at < box.x + box.w - 40) context.fillText(clock(value, this.across.step, axes.total), Math.max(at, box.x + 3), box.y + box.h + 3);
     }
     context.textAlign = "right";
-    context.fillText(axes.end >= 600 ? "min:s" : "s", box.x + box.w, box.y + box.h + 3);
+    context.fillText(unitOf(axes.total), box.x + box.w, box.y + box.h + 3);
   }
 
   // Where there are more samples than pixels, each column of pixels shows the least and the greatest of its own.
@@ -191,8 +205,8 @@ class Plot {
     for (const row of run) context.lineTo(row.x, y(row.top));
     for (const row of run.slice().reverse()) context.lineTo(row.x, y(row.bottom));
     context.fill();
-    context.strokeStyle = context.fillStyle = `rgb(${colour.join()})`;
-    context.lineWidth = 1.5;
+    context.strokeStyle = context.fillStyle = `rgba(${colour.join()},${thick ? 0.6 : 1})`; // many lie over one another
+    context.lineWidth = thick ? 1 : 1.5;
     context.lineJoin = "round";
     context.beginPath();
     for (const row of run) {
