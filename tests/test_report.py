@@ -15,6 +15,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from torchpose import report as report_module
 from torchpose.activity.diary import Entry
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES
 from torchpose.body.ellipsoid import outline
@@ -187,12 +188,12 @@ def test_stretches_make_the_same_page_as_the_whole(tmp_path: Path, body: BodyMod
 
 
 def test_a_long_run_is_thinned_and_says_so(tmp_path: Path, body: BodyModel):
-    poses = make_poses(body, 100)
+    poses = make_poses(body, 500)
     report = Report("long", body, [body.default_size(1)] * 2, 20_000)
-    for start in range(0, 20_000, 100):
+    for start in range(0, 20_000, 500):
         for person in range(2):
             report.add_poses(person, start, poses)
-        for i in range(start, start + 100):
+        for i in range(start, start + 500):
             if report.wants(i):
                 report.add_image(i, torch.rand(3, 240, 320))  # noise: the least that JPEG can shorten
                 for person in range(2):
@@ -202,22 +203,29 @@ def test_a_long_run_is_thinned_and_says_so(tmp_path: Path, body: BodyModel):
     _, data = read_page(tmp_path / "report.html")
     position = unpack(data["position"], "<i4")
     assert (position[0], position[-1], len(position)) == (0, 19_999, 4000)
-    np.testing.assert_array_equal(unpack(data["frame"], "<i4"), 10 + position % 100)
+    np.testing.assert_array_equal(unpack(data["frame"], "<i4"), 10 + position % 500)
     assert len(data["images"]) == 200
     assert data["thinned"][0].startswith("Angles, statuses and 3-D poses of 4,000 of 20,000 frames")
     assert data["thinned"][1].startswith("Pictures and points of 200 of 20,000 frames")
     assert data["summary"]["problems"][-1] == "and 19,800 more, see summary.json"
 
 
-def test_pictures_are_shortened_until_they_fit(tmp_path: Path, body: BodyModel):
-    """The worst there is: noise in every pixel of the largest picture of every frame."""
-    report = make_report(body, make_poses(body, 40))
-    noise = torch.rand(3, 480, 640)
-    for i in range(40):
-        report.add_image(i, noise)
+def test_pictures_are_shortened_until_they_fit(
+    tmp_path: Path, body: BodyModel, monkeypatch: pytest.MonkeyPatch
+):
+    """The worst there is: noise in every pixel, which JPEG cannot shorten."""
+    monkeypatch.setattr(report_module, "IMAGE_BYTES", 400_000)
+    report = make_report(body, make_poses(body, 4))
+    for i, size in enumerate(((480, 640), (30, 40), (480, 640), (900, 1200))):
+        report.add_image(i, torch.rand(3, *size))
     report.write(tmp_path / "report.html", SUMMARY)
-    assert (tmp_path / "report.html").stat().st_size < 15e6
-    assert len(read_page(tmp_path / "report.html")[1]["images"]) == 40
+    pictures = [base64.b64decode(image) for image in read_page(tmp_path / "report.html")[1]["images"]]
+    assert len(pictures) == 4
+    assert max(map(len, pictures)) <= 100_000
+    widths = [cv2.imdecode(np.frombuffer(picture, np.uint8), 0).shape[1] for picture in pictures]
+    assert widths[1] == 40
+    assert max(widths) <= 640
+    assert min(widths[0], *widths[2:]) > 200
 
 
 def test_names_and_warnings_stay_words(tmp_path: Path, body: BodyModel):
@@ -226,6 +234,7 @@ def test_names_and_warnings_stay_words(tmp_path: Path, body: BodyModel):
     report.write(tmp_path / "report.html", SUMMARY | {"warnings": [wicked], "problems": [wicked]})
     add_activities(tmp_path / "report.html", [[Entry(0.0, 1.0, wicked, 1.0)]])
     page, data = read_page(tmp_path / "report.html")
+    assert not set("<>") & set(page.texts["data"] + page.texts["activities"])
     assert [tag for tag, _ in page.tags].count("script") == 3
     assert all("onerror" not in attributes for _, attributes in page.tags)
     assert data["summary"]["warnings"] == [wicked]
@@ -474,16 +483,24 @@ def test_a_long_run_starts_with_a_stretch_and_says_which_frames_have_pictures(
     report.add_poses(0, 0, poses)
     for i in report.shown.tolist():
         report.add_image(i, torch.rand(3, 24, 32))
+        report.add_points(0, i, poses.joints[i].float(), torch.arange(15))
     report.write(tmp_path / "report.html", SUMMARY)
     page = opened(tmp_path / "report.html")
     assert page.inner_text("#shown") == "20 of 100 s"
     page.keyboard.press("ArrowRight")
     assert "the nearest of 200 with a picture" in page.inner_text("#image-caption")
+    for name in ("body", "skeleton"):
+        page.click(f"#layers >> text={name}")
+    without = picture_of(page)
+    page.click("#layers >> text=points")
+    assert (picture_of(page) == without).all()  # points are shown with their own frame alone
+    page.click("#layers >> text=points")
     views, plots = (page.locator(name).bounding_box() for name in ("#views", "#plots"))
     assert views["x"] + views["width"] <= plots["x"]
     page.keyboard.press("PageDown")
     assert frame_of(page) == 10 + report.shown[1]
     assert "nearest" not in page.inner_text("#image-caption")
+    assert (picture_of(page)[..., 3] == 255).sum() > (without[..., 3] == 255).sum() + 20
     page.keyboard.press("End")  # the stretch goes along
     left, right = (page.locator(f".plot >> nth=0 >> {name}").bounding_box() for name in ("canvas", ".cursor"))
     assert left["x"] < right["x"] <= left["x"] + left["width"]
