@@ -56,7 +56,7 @@ def test_each_has_files_of_their_own_and_nothing_stale_stays(result: File):
         *("poses.csv", "poses.npz", "angles.png", "person.yaml"),
         *("poses_2.csv", "poses_2.npz", "angles_2.png", "person_2.yaml"),
         *(f"poses{mark}.{kind}" for mark in ("", "_2") for kind in ("mot", "trc", "bvh")),
-        *("overlay.mp4", "summary.json"),
+        *("overlay.mp4", "summary.json", "report.html"),
     }
     others = json.loads((result / "summary.json").read_text())["others"]
     assert len(others) == 1

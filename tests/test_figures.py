@@ -91,6 +91,37 @@ def test_a_frame_without_a_pose_has_its_status_only(image: torch.Tensor):
     assert longer[30:60].any()
 
 
+def test_angles_stand_beside_their_joints_each_on_its_own_side(image: torch.Tensor):
+    joints = torch.full((15, 2), torch.nan)
+    marks = (("knee_left", "71"), ("knee_right", "23"), ("elbow_left", "5"))
+    for left, right in ((95.0, 75.0), (75.0, 95.0), (80.0, 80.0)):
+        joints[JOINT_NAMES.index("knee_left")] = torch.tensor([left, 60.0])
+        joints[JOINT_NAMES.index("knee_right")] = torch.tensor([right, 60.0])
+        drawn = draw_overlay(image, Overlay("", joints=joints, marks=marks))
+        sides = {}
+        for name, colour in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)):
+            own = ((drawn * 255).round() == torch.tensor(colour)[:, None, None]).all(0)
+            assert own.sum() > 50
+            sides[name] = own.nonzero()[:, 1].float()
+        warm, cool = (sides["left"], sides["right"]) if left >= right else (sides["right"], sides["left"])
+        assert warm.min() > max(left, right) >= min(left, right) > cool.max()
+    assert not changed(image, drawn)[:40].any()  # the elbow is nowhere
+
+
+def test_names_stand_above_heads_and_statuses_in_rows(image: torch.Tensor):
+    joints = torch.full((15, 2), torch.nan)
+    joints[JOINT_NAMES.index("head")] = torch.tensor([120.0, 70.0])
+    joints[JOINT_NAMES.index("neck")] = torch.tensor([120.0, 90.0])
+    first, second = (changed(image, draw_overlay(image, Overlay("2 lost", row=row))) for row in (0, 1))
+    rows = [drawn.any(1).nonzero()[:, 0] for drawn in (first, second)]
+    assert rows[0].max() < rows[1].min()
+    named = changed(image, draw_overlay(image, Overlay("", joints=joints, name="2")))
+    plain = changed(image, draw_overlay(image, Overlay("", joints=joints)))
+    place = (named & ~plain).nonzero().float().mean(0)
+    assert 35 < place[0] < 65
+    assert place[1] == pytest.approx(120, abs=3)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_images_keep_their_size_and_dtype(dtype: torch.dtype):
     image = torch.rand(3, 481, 643, dtype=dtype)

@@ -60,7 +60,7 @@ def test_every_file_is_there_and_nothing_else(result: Path):
     names = {path.name for path in result.iterdir()}
     assert names == {
         *("poses.csv", "poses.npz", "poses.mot", "poses.trc", "poses.bvh"),
-        *("person.yaml", "overlay.mp4", "angles.png", "summary.json"),
+        *("person.yaml", "overlay.mp4", "angles.png", "summary.json", "report.html"),
     }
 
 
@@ -96,6 +96,7 @@ def test_the_summary_says_what_was_wrong(result: Path):
     assert summary["status"]["absent"] == summary["status"]["lost"] == 1
     assert summary["problems"] == [pytest.approx(summary["problems"][0])]
     assert f"{BROKEN:06d}.png" in summary["problems"][0]
+    assert summary["warnings"] == []
     assert summary["settings"]["pose"]["height"] == 1.75
     assert summary["version"] == tp.__version__
 
@@ -238,6 +239,9 @@ def test_a_side_by_side_video_s_poses_are_right_and_its_other_frame_rate_is_said
         f"warning: {path} has 12 frames a second and the calibration says 10: times are by"
     )
     assert error.count("\n") == 1
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())["warnings"]
+    assert [f"warning: {sentence}\n" for sentence in told] == [error]
+    assert "12 frames a second" in (tmp_path / "out" / "report.html").read_text()
     sequence = tp.read_poses_csv(tmp_path / "out" / "poses.csv")
     assert sequence.time_s.tolist() == [0, 0.1]
     assert all(sequence.answered)

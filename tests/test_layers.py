@@ -78,8 +78,9 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
         *("export", "trajectory_filter", "resampling", "opensim", "bvh", "c3d_file", "motion_export"),
-        *("figures", "timeline", "journal", "activities", "eyes", "pipeline", "window", "people"),
-        *("parts", "overlay", "session", "web_view", "live", "clips", "study", "cli"),
+        *("figures", "timeline", "journal", "report", "rerun_log", "activities"),
+        *("eyes", "pipeline", "window", "people", "parts", "overlay", "picture", "session"),
+        *("web_view", "live", "clips", "study", "cli"),
     ),
 }
 ORDER = [

@@ -15,6 +15,7 @@ from torchpose.activity.recognizer import Recognizer
 from torchpose.body.model import BodyModel
 from torchpose.export import JOINT_NAMES, PoseSequence, read_pose_sd, read_poses_npz
 from torchpose.journal import Journal, write_activities_csv
+from torchpose.report import add_activities
 
 Diaries = dict[str, list[Entry]]
 
@@ -59,6 +60,7 @@ class ActivityWriter:
     def write(self, output: Path, body: BodyModel, recording: str) -> Diaries:
         """Write `activities.csv`, `activities_2.csv` and so on beside the poses in a folder; returns the entries.
 
+        A `report.html` there gets them, too.
         `recording` is the journal's name for it: adding it again replaces it.
         """
         for old in output.glob("activities*.csv"):  # an earlier run may have found more people
@@ -71,6 +73,9 @@ class ActivityWriter:
             entries = self.diary.write(clip, sequence.time_s)
             write_activities_csv(output / f"activities{mark}.csv", entries)
             found[self.person + mark] = entries
+        page = output / "report.html"
+        if page.exists():
+            add_activities(page, found.values())
         if self.journal is not None:
             assert self.started is not None
             for person, entries in found.items():

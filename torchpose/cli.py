@@ -34,8 +34,9 @@ from torchpose.people import People, PeopleConfig
 from torchpose.pipeline import PoseConfig, StereoToPose
 from torchpose.recording import Recording, open_recording
 from torchpose.rendered import demo_recording
+from torchpose.rerun_log import check_rerun
 from torchpose.scaled import at_most
-from torchpose.session import Session, is_interrupted, settings_of, summary_table
+from torchpose.session import Session, is_interrupted, kept_warnings, settings_of, summary_table
 from torchpose.settings import compose_config, config_groups
 from torchpose.study import (
     THESIS_ACCURACY,
@@ -75,6 +76,7 @@ class InferConfig:
     max_width: int = 800  # px; wider images are shrunk as they are read, and are matched much faster
     align: bool = True  # move the right images' rows onto the left's where they are more than 0.25 px apart
     fresh: bool = False  # start over instead of continuing an interrupted run
+    viz: bool = False  # write poses.rrd for the Rerun viewer, too; needs the extra viz
     seed: int = 0  # the same seed gives the same results
     device: str = "cpu"  # where to compute: cpu, cuda, cuda:1, mps
     threads: int = 1  # of the processor; more help only where cores are idle
@@ -112,6 +114,8 @@ class InferConfig:
                 f"max_width must be at least 64 px, got {self.max_width}; 640 to 1280 make sense"
             )
         self._check_journal()
+        if self.viz:
+            check_rerun()
         _check_machine(self.seed, self.threads)
 
     def _check_journal(self) -> None:
@@ -211,6 +215,11 @@ def train_main(argv: Sequence[str]) -> int:
 
 def infer(config: InferConfig, device: torch.device) -> None:
     """Recover the poses of a recording, and write and print the results."""
+    with kept_warnings() as told:
+        _infer(config, device, told)
+
+
+def _infer(config: InferConfig, device: torch.device, told: list[str]) -> None:
     output, settings = Path(config.output), settings_of(config)
     activities = _activities(config)
     camera = None if config.recording is None else camera_numbers(config.recording)
@@ -222,7 +231,8 @@ def infer(config: InferConfig, device: torch.device) -> None:
     def session_of(recording: Recording, rows_before: float | None) -> Session:
         model = StereoToPose(recording.camera, config.eyes, pose).to(device)
         people = People(model, config.people)
-        return Session(people, recording, output, settings, __version__, rows_before, config.export)
+        export, viz = config.export, config.viz
+        return Session(people, recording, output, settings, __version__, rows_before, export, told, viz)
 
     if camera is not None and live:
         summary = _follow_live(config, camera, output, session_of)

@@ -41,7 +41,7 @@ STATUS_COLOURS: dict[str, Colour] = {
     "entering": (86, 180, 233),
     "tracked": (120, 220, 150),
     "partial": (240, 228, 66),
-    "recovered": (240, 228, 66),
+    "recovered": (214, 130, 178),
     "lost": (255, 110, 90),
 }
 BONES: tuple[tuple[str, str], ...] = (
@@ -64,11 +64,11 @@ _SIGNS = {
     "abduction": "abduction +, adduction −",
     "rotation": "rotation, + inward",
 }
-_WORST_SD = np.pi / 4  # rad; an angle that is less certain says nothing, and its band would fill the panel
+WORST_SD = np.pi / 4  # rad; an angle that is less certain says nothing, and its band would fill the panel
 _NO_POSE: dict[str, Any] = {"facecolor": "0.92", "edgecolor": "0.75", "hatch": "////", "linewidth": 0}
 _PANEL_COLUMNS = 3
 _MOST_DRAWN = 4000  # frames of a plot whose panels are 400 px wide; of more, each second, third and so on
-_LEAST_SPAN = 20.0  # degrees from the bottom to the top of a panel, so that noise looks like noise
+LEAST_SPAN = 20.0  # degrees from the bottom to the top of a panel, so that noise looks like noise
 _SHIFT = 4  # bits behind the point in OpenCV's coordinates
 _FAR = 1e5  # px; beyond it OpenCV's coordinates would overflow
 
@@ -83,6 +83,9 @@ class Overlay:
     points: Float[Tensor, "num 2"] | None = None  # px
     labels: Int[Tensor, " num"] | None = None  # the part of each point; anything but 0 to 13 is none
     text: tuple[str, ...] = ()  # lines below the status; plain ASCII
+    row: int = 0  # in which the status stands: several people are drawn one after the other
+    name: str = ""  # above the head
+    marks: tuple[tuple[str, str], ...] = ()  # joint and what stands beside it
 
 
 def draw_overlay(image: Float[Tensor, "3 height width"], overlay: Overlay) -> Float[Tensor, "3 height width"]:
@@ -96,6 +99,7 @@ def draw_overlay(image: Float[Tensor, "3 height width"], overlay: Overlay) -> Fl
         _draw_outlines(canvas, overlay.outlines, round(unit))
     if overlay.joints is not None:
         _draw_skeleton(canvas, overlay.joints, unit)
+        _draw_marks(canvas, overlay, unit)
     _draw_text(canvas, overlay, unit)
     return from_numpy(canvas).permute(2, 0, 1).to(image.dtype).div(255)
 
@@ -111,7 +115,7 @@ def plot_angles(path: Path, sequence: PoseSequence) -> None:
     from matplotlib.patches import Patch
 
     clean = sequence[:: max(1, len(sequence) // _MOST_DRAWN)].without_stale_numbers()
-    panels = _panels(clean.angle_names)
+    panels = angle_panels(clean.angle_names)
     rows = -(-len(panels) // _PANEL_COLUMNS)
     figure = Figure(figsize=(11, 0.9 + 1.75 * rows), layout="constrained")
     axes = figure.subplots(rows, _PANEL_COLUMNS, squeeze=False, sharex=True).ravel()
@@ -183,7 +187,7 @@ def _draw_confusion(axes: "Axes", evaluation: Evaluation, named: bool) -> None:
     axes.tick_params(length=0)
 
 
-def _panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:
+def angle_panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:
     """The columns of each panel's lines, by side: {"neck_flexion": {"": 3}, "hip_flexion": {"left": 5}}."""
     panels: dict[str, dict[str, int]] = {}
     for column, name in enumerate(names):
@@ -193,7 +197,8 @@ def _panels(names: tuple[str, ...]) -> dict[str, dict[str, int]]:
     return panels
 
 
-def _panel_title(name: str) -> str:
+def panel_title(name: str) -> str:
+    """What a panel of `angle_panels` shows, in words, with the meaning of the sign."""
     for ending, meaning in _SIGNS.items():
         if name.endswith(ending):
             joint = name.removesuffix(ending).strip("_") or name.removesuffix("_rotation")
@@ -207,7 +212,7 @@ def _draw_panel(axes: "Axes", sequence: PoseSequence, name: str, columns: dict[s
     low, high = np.inf, -np.inf
     for side, column in columns.items():
         angle, sd = (np.rad2deg(values[:, column].numpy()) for values in (sequence.angles, sequence.angle_sd))
-        angle = np.where(sd > np.rad2deg(_WORST_SD), np.nan, angle)  # an unknown sd is not a large one
+        angle = np.where(sd > np.rad2deg(WORST_SD), np.nan, angle)  # an unknown sd is not a large one
         colour = _hex(colours[side])
         axes.fill_between(time, angle - 2 * sd, angle + 2 * sd, color=colour, alpha=0.2, linewidth=0)
         axes.plot(time, angle, color=colour, linewidth=1.2, marker=".", markersize=1.5)
@@ -217,12 +222,12 @@ def _draw_panel(axes: "Axes", sequence: PoseSequence, name: str, columns: dict[s
         high = max(high, angle[known].max(initial=-np.inf) + margin)
     if low > high:
         low = high = 0.0
-    half = max(_LEAST_SPAN, 1.1 * (high - low)) / 2
+    half = max(LEAST_SPAN, 1.1 * (high - low)) / 2
     axes.set_ylim((low + high) / 2 - half, (low + high) / 2 + half)
     for start, stop in _gaps(sequence):
         axes.axvspan(start, stop, **_NO_POSE, zorder=0)
     axes.axhline(0, color="0.7", linewidth=0.6, zorder=0.5)
-    axes.set_title(_panel_title(name), fontsize=9, loc="left")
+    axes.set_title(panel_title(name), fontsize=9, loc="left")
     axes.tick_params(labelsize=8)
     axes.margins(x=0)
     axes.spines[["top", "right"]].set_visible(False)
@@ -280,13 +285,68 @@ def _draw_skeleton(canvas: np.ndarray, joints: Float[Tensor, "15 2"], unit: floa
             cv2.circle(canvas, centre, radius, (255, 255, 255), cv2.FILLED, cv2.LINE_AA, _SHIFT)
 
 
+def _draw_marks(canvas: np.ndarray, overlay: Overlay, unit: float) -> None:
+    """The name above the head, and the marks: of a left and a right joint each to its own side, so they never meet."""
+    assert overlay.joints is not None
+    pixels = dict(
+        zip(JOINT_NAMES, overlay.joints.detach().cpu().double().numpy().clip(-_FAR, _FAR), strict=True)
+    )
+    size, pad = 0.4 * unit, 2 * unit
+    for joint, text in overlay.marks:
+        left = joint.endswith("_left")
+        side, other = ("_left", "_right") if left else ("_right", "_left")
+        place, partner = pixels[joint], pixels[joint.removesuffix(side) + other]
+        if not np.isfinite(place).all():
+            continue
+        outward = 1 if place[0] > partner[0] or (left and not place[0] < partner[0]) else -1
+        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, round(unit))
+        start = place[0] + outward * 8 * unit - (0 if outward > 0 else width)
+        corners = (
+            (start - pad, place[1] - height / 2 - pad),
+            (start + width + pad, place[1] + height / 2 + pad),
+        )
+        low, high = (tuple(round(value) for value in corner) for corner in corners)
+        cv2.rectangle(canvas, low, high, LEFT_COLOUR if left else RIGHT_COLOUR, cv2.FILLED)
+        _write(canvas, text, (start, place[1] + height / 2), size, (255, 255, 255), round(unit))
+    head, neck = pixels["head"], pixels["neck"]
+    if overlay.name and np.isfinite([head, neck]).all():
+        (width, _), _ = cv2.getTextSize(overlay.name, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit, round(unit))
+        top = min(head[1], neck[1]) - 0.9 * np.linalg.norm(head - neck) - 4 * unit
+        _write(
+            canvas,
+            overlay.name,
+            (head[0] - width / 2, max(top, 12 * unit)),
+            0.5 * unit,
+            (255, 255, 255),
+            round(unit),
+            True,
+        )
+
+
 def _draw_text(canvas: np.ndarray, overlay: Overlay, unit: float) -> None:
-    size, step = 0.42 * unit, 16 * unit
-    for row, line in enumerate((overlay.status, *overlay.text)):
-        colour = STATUS_COLOURS.get(line, (255, 255, 255)) if row == 0 else (255, 255, 255)
-        origin = (round(8 * unit), round(step * (row + 1.1)))
-        for shade, width in (((0, 0, 0), round(3 * unit)), (colour, round(unit))):
-            cv2.putText(canvas, line, origin, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
+    for row, line in enumerate((overlay.status, *overlay.text), overlay.row):
+        colour = (
+            STATUS_COLOURS.get(line.rpartition(" ")[2], (255, 255, 255))
+            if row == overlay.row
+            else (255, 255, 255)
+        )
+        origin = (8 * unit, 17 * unit * (row + 1.1))
+        _write(canvas, line, origin, 0.48 * unit, colour, round(unit), True)
+
+
+def _write(
+    canvas: np.ndarray,
+    text: str,
+    origin: tuple[float, float],
+    size: float,
+    colour: Colour,
+    width: int,
+    rim: bool = False,
+) -> None:
+    """ASCII text whose line starts at `origin`; the rim is dark."""
+    place = (round(origin[0]), round(origin[1]))
+    for shade, thickness in (((0, 0, 0), 3 * width), (colour, width))[0 if rim else 1 :]:
+        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, shade, thickness, cv2.LINE_AA)
 
 
 def _fixed_point(pixels: np.ndarray) -> np.ndarray:

@@ -259,7 +259,7 @@ class Watch:
                 if (value := degrees.get(f"{name}_{side}", float("nan"))) is not None
             }
             if image is not None:
-                drawn = overlays(model, sequence, [LabelledPoints.of(pose)], words=k == 0)[0]
+                drawn = overlays(model, sequence, [LabelledPoints.of(pose)], k if len(poses) > 1 else None)[0]
                 image = draw_overlay(image, drawn)
         if image is None:
             frame = self.live[len(self.live) - 1]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from torchpose.atomic import replacing
@@ -95,8 +95,15 @@ class Parts:
         sequences: Sequence[PoseSequence],
         points: Sequence[Sequence[LabelledPoints]],
         states: Sequence[Mapping[str, Tensor]],
+        depths: Sequence[UInt8[np.ndarray, " bytes"]] | None = None,
     ) -> None:
-        """One part of everybody, up to frame `end`: points, what the next frame starts from, and last the poses."""
+        """One part of everybody, up to frame `end`: points, what the next frame starts from, and last the poses.
+
+        `depths` are the frames' depth images as PNG, where they are wanted later.
+        """
+        if depths is not None:
+            with replacing(self.path(0, "depth", end)) as partial:
+                np.savez(partial, *depths)
         earlier = list(self.folder.rglob("state_*.npz"))
         for person in reversed(range(len(sequences))):
             if not states[person]:  # came after the part's end
@@ -116,12 +123,22 @@ class Parts:
         for path in earlier:  # nobody goes on from these any more
             path.unlink()
 
+    def depth(self, position: int) -> UInt8[np.ndarray, " bytes"]:
+        """The depth image of a frame as it was saved; nothing where there is none."""
+        ends = self.ends
+        part = bisect.bisect_right(ends, position)
+        path = self.path(0, "depth", ends[part])
+        if not path.exists():
+            return np.zeros(0, np.uint8)
+        with np.load(path) as saved:
+            return saved[f"arr_{position - (ends[part - 1] if part else 0)}"]
+
     def person(self, number: int) -> "PersonParts":
         """All that the parts have of a person, counted from 0."""
         return PersonParts(self, number)
 
     def path(self, person: int, kind: str, end: int) -> Path:
-        """The file of a person's part: `poses`, `points` or `state`."""
+        """The file of a person's part: `poses`, `points` or `state`; of the frames themselves (person 0) `depth`."""
         folder = self.folder if person == 0 else self.folder / f"person_{person + 1}"
         return folder / f"{kind}_{end:08d}.npz"
 

@@ -14,32 +14,33 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import UInt8
 from torch import Tensor
 
 from torchpose.atomic import require_writable
 from torchpose.export import (
     PoseSequence,
-    open_video,
     write_poses_csv,
     write_poses_npz,
     write_summary,
 )
-from torchpose.eyes import depth_picture
-from torchpose.figures import draw_overlay, plot_angles
+from torchpose.figures import plot_angles
 from torchpose.motion_export import ExportConfig, ExportFormat, export_motion
-from torchpose.overlay import overlays
 from torchpose.parts import LabelledPoints, Parts, PersonParts
 from torchpose.people import People
+from torchpose.picture import draw_pictures
 from torchpose.pipeline import FramePose
-from torchpose.recording import Recording, UnreadableFrame, readable_frames, spread_positions
+from torchpose.recording import Recording, readable_frames, spread_positions
 from torchpose.registration.size import write_size
+from torchpose.report import Report
+from torchpose.rerun_log import depth_png
 from torchpose.terminal import Progress, coloured, table
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
 from torchpose.window import PeopleWindows
@@ -48,12 +49,10 @@ CHECKED = 3  # frames whose rows are compared
 FEWEST = 5  # frames with a pose, from which somebody further is written
 SPACE = 60_000  # bytes that the parts and the files of a frame take, and some more
 _PARTS, _FILES = "parts", "files"  # folders of a run that is not finished
-_DRAWN = 50  # frames whose outlines are computed at once
-_SAME_RATE = 0.01  # relative
 _MOST_PROBLEMS = 4  # that are printed
 # Files that a run may write or not: those of people, by number, and in chosen formats.
 _OURS = re.compile(
-    rf"(poses|angles|person)(_\d+)?(_filtered)?\.(csv|npz|png|yaml|{'|'.join(kind.value for kind in ExportFormat)})"
+    rf"(poses|angles|person)(_\d+)?(_filtered)?\.(csv|npz|rrd|png|yaml|{'|'.join(kind.value for kind in ExportFormat)})"
 )
 
 
@@ -61,7 +60,7 @@ class Session:
     """Runs a model over a recording into a folder. The same settings on the same recording go on where they stopped.
 
     `rows_before` is how far apart, in px of the recording's images, the rows were before they were corrected; None
-    where they were not.
+    where they were not; `told` gathers the warnings, see `kept_warnings`; `viz` writes `poses.rrd`, too.
     """
 
     def __init__(
@@ -73,6 +72,8 @@ class Session:
         version: str,
         rows_before: float | None = None,
         export: ExportConfig | None = None,
+        told: list[str] | None = None,
+        viz: bool = False,
     ):
         self.people, self.model = people, people.model
         self.recording, self.output = recording, output
@@ -81,6 +82,8 @@ class Session:
         self.export.check_rate(recording.camera.frame_rate)
         self.parts = Parts(output / _PARTS)
         self.problems: list[str] = []
+        self.told = [] if told is None else told
+        self.viz = viz
         self.kept: list[dict[str, Tensor]] = []  # what an interrupted run goes on from, of each person
 
     def run(self, fresh: bool = False, max_frames: int | None = None) -> dict[str, Any]:
@@ -152,11 +155,13 @@ class Session:
         shutil.rmtree(staged, ignore_errors=True)
         found = self._found()
         with self.model.stopwatch.measure("export"):
-            notes = {**notes, "bvh": self._write(found, staged)}
+            report = self._report(found)
+            notes = {**notes, "bvh": self._write(found, staged, report)}
         summary = self._summary(found[0].sequence, time.perf_counter() - begin, followed)
         summary["others"] = [dict(Counter(other.sequence.status)) for other in found[1:]]
-        summary["files"] = sorted([*(path.name for path in staged.iterdir()), "summary.json"])
-        summary |= notes
+        files = [path.name for path in staged.iterdir()]
+        summary |= {**notes, "files": sorted([*files, "report.html", "summary.json"])}
+        report.write(staged / "report.html", summary)
         write_summary(staged / "summary.json", summary)
         self._publish(staged)
         self.parts.remove()
@@ -167,8 +172,17 @@ class Session:
         people = [self.parts.person(number) for number in range(self.parts.people)]
         return [one for one in people if one.number == 0 or sum(one.sequence.answered) >= FEWEST]
 
-    def _write(self, found: Sequence[PersonParts], folder: Path) -> dict[str, Any]:
-        """Every file but the summary, for which notes come back of files that do not hold every pose.
+    def _report(self, found: Sequence[PersonParts]) -> Report:
+        """The page, with the poses."""
+        title = Path(str(self.settings.get("recording") or "demo")).name
+        sizes = [self.people.followers[person.number].model.size for person in found]
+        report = Report(title, self.model.body, sizes, len(found[0].sequence))
+        for number, person in enumerate(found):
+            report.add_poses(number, 0, person.sequence)
+        return report
+
+    def _write(self, found: Sequence[PersonParts], folder: Path, report: Report) -> dict[str, Any]:
+        """Every file but page and summary, for which notes come back of files that do not hold every pose.
 
         A person's `sequence` has no covariances; `points(position)` are of a part.
         """
@@ -181,7 +195,8 @@ class Session:
             plot_angles(folder / f"angles{mark}.png", person.sequence)
             write_size(folder / f"person{mark}.yaml", model.body, model.size)
             notes |= export_motion(folder, mark, person.sequence, model.body, model.size, self.export)
-        self._draw(found, folder / "overlay.mp4")
+        people = [(self.people.followers[person.number].model, person) for person in found]
+        draw_pictures(folder, self.recording, people, report, self.viz)
         return notes
 
     def _publish(self, staged: Path) -> None:
@@ -227,41 +242,8 @@ class Session:
             ],
             [[LabelledPoints.of(frame) for frame in frames] for frames in people],
             [window.state for window in windows.windows],
+            [_depth_of(frame) for frame in people[0]] if self.viz else None,
         )
-
-    def _draw(self, found: Sequence[PersonParts], path: Path) -> None:
-        """The overlay video, from the recording's images and the poses; it takes as long as the recording did."""
-        camera, times = self.model.camera, found[0].sequence.time_s
-        with open_video(path, camera.width, camera.height, video_rate(times, camera.frame_rate)) as video:
-            for start in range(0, len(times), _DRAWN):
-                positions = range(start, min(start + _DRAWN, len(times)))
-                layers = [
-                    overlays(
-                        self.people.followers[person.number].model,
-                        person.sequence[start : start + _DRAWN],
-                        [person.points(position) for position in positions],
-                        words=person.number == 0,
-                    )
-                    for person in found
-                ]
-                for position, drawn in zip(positions, zip(*layers, strict=True), strict=True):
-                    image = self._image(position)
-                    for number, overlay in enumerate(drawn):
-                        if number == 0 or overlay.outlines is not None:
-                            image = draw_overlay(image, overlay)
-                    video.write(image)
-
-    def _image(self, position: int) -> Float[Tensor, "3 height width"]:
-        """What a person sees of a frame: its left image, its depth as grey, or black where it cannot be read."""
-        camera = self.model.camera
-        try:
-            frame = self.recording[position]
-        except UnreadableFrame:
-            return torch.zeros(3, camera.height, camera.width)
-        if frame.left is not None:
-            return frame.left
-        assert frame.depth is not None
-        return depth_picture(frame.depth[None])[0]
 
     def _summary(self, sequence: PoseSequence, seconds: float, frames: int) -> dict[str, Any]:
         counts = Counter(sequence.status)
@@ -289,16 +271,28 @@ class Session:
             "seconds_per_frame": seconds / max(frames, 1),
             "cpu_ms_per_frame": {name: 1000 * value / max(frames, 1) for name, value in stages.items()},
             "problems": self.problems,
+            "warnings": list(dict.fromkeys(self.told)),
         }
 
 
-def video_rate(time_s: Float[Tensor, " time"], rate: float) -> float:
-    """Frames a second, Hz, at which a video lasts as long as these frames did; the camera's `rate` if that fits."""
-    elapsed = float(time_s[-1] - time_s[0]) if len(time_s) > 1 else 0.0
-    if not elapsed > 0:
-        return rate
-    measured = (len(time_s) - 1) / elapsed
-    return rate if abs(measured - rate) <= _SAME_RATE * rate else max(round(measured, 2), 0.1)
+def _depth_of(frame: FramePose) -> UInt8[np.ndarray, " bytes"]:
+    """A frame's depth as a PNG; nothing where it was not seen."""
+    return np.zeros(0, np.uint8) if frame.sight is None else depth_png(frame.sight.depth[0])
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """A list to which the sentences of all warnings are added that are shown while the block runs."""
+    told: list[str] = []
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def keep(message: Warning | str, *details: Any, **more: Any) -> None:
+            told.append(str(message))
+            show(message, *details, **more)
+
+        warnings.showwarning = keep
+        yield told
 
 
 def is_interrupted(output: Path, settings: Mapping[str, Any], version: str) -> bool:
