@@ -170,13 +170,17 @@ class Session:
         self._draw(found, folder / "overlay.mp4")
 
     def _publish(self, staged: Path) -> None:
-        """Move the files into the output folder, and remove those of further people that an earlier run found."""
+        """Move the files into the output folder, and remove those of an earlier run that this one did not write."""
         files = sorted(staged.iterdir())
         names = {file.name for file in files}
         for file in files:
-            for old in self.output.glob(f"{file.stem}_*{file.suffix}"):
+            for old in self.output.glob(
+                f"{file.stem}_*{file.suffix}"
+            ):  # of people whom only an earlier run found
                 if old.stem.removeprefix(f"{file.stem}_").isdigit() and old.name not in names:
                     old.unlink()
+        for name in _files_of(self.output) - names:
+            (self.output / name).unlink(missing_ok=True)
         for file in files:
             os.replace(file, self.output / file.name)
 
@@ -285,6 +289,15 @@ def video_rate(time_s: Float[Tensor, " time"], rate: float) -> float:
         return rate
     measured = (len(time_s) - 1) / elapsed
     return rate if abs(measured - rate) <= _SAME_RATE * rate else max(round(measured, 2), 0.1)
+
+
+def _files_of(output: Path) -> set[str]:
+    """The files that an earlier run wrote into a folder, by its summary."""
+    try:
+        files = json.loads((output / "summary.json").read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):  # none, or of an older version
+        return set()
+    return {name for name in files if isinstance(name, str) and Path(name).name == name}
 
 
 def is_interrupted(output: Path, settings: Mapping[str, Any], version: str) -> bool:
