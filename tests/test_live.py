@@ -130,6 +130,12 @@ class Browser(threading.Thread):
             time.sleep(0.02)
 
 
+@pytest.fixture(autouse=True)
+def no_plot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plot takes a second, and is tested elsewhere."""
+    monkeypatch.setattr("torchpose.session.plot_angles", lambda path, _: path.write_bytes(b""))
+
+
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[Browser]:
     """Browsers that are told the port of the page."""

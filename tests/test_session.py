@@ -1,6 +1,7 @@
 """A whole run over awkward recordings, on awkward disks, and stopped half way."""
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -181,6 +182,13 @@ def folder(nobody: Shown, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_recording(tmp_path_factory.mktemp("r") / "depth", nobody.camera, nobody.frames, empty)
 
 
+@pytest.fixture(autouse=True)
+def no_plot(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """The plot takes a second, and is tested elsewhere."""
+    if "one_frame" not in request.node.name:
+        monkeypatch.setattr(module, "plot_angles", lambda path, _: path.write_bytes(b""))
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 4 MB; skipped where none may be mounted."""
@@ -296,6 +304,19 @@ def test_a_write_that_fails_half_way_keeps_what_was_there(
 ):
     """Without a small disk: the operating system's answer is made up."""
     run(nobody, tmp_path)
+    # What only an earlier run wrote goes with it; what it did not write stays.
+    listed = json.loads((tmp_path / "summary.json").read_text())
+    assert sorted(listed["files"]) == sorted(path.name for path in tmp_path.iterdir())
+    listed["files"] += ["poses.rrd", "../outside"]
+    (tmp_path / "summary.json").write_text(json.dumps(listed))
+    for kept in ("poses.rrd", "notes.txt", "poses_last.csv"):
+        (tmp_path / kept).write_text("")
+    (tmp_path.parent / "outside").write_text("")
+    run(nobody, tmp_path)
+    assert not (tmp_path / "poses.rrd").exists()
+    assert (tmp_path / "notes.txt").exists()
+    assert (tmp_path / "poses_last.csv").exists()
+    assert (tmp_path.parent / "outside").exists()
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def full(path: Path, **arrays: np.ndarray) -> None:

@@ -8,7 +8,6 @@ import hashlib
 import json
 import math
 import os
-import re
 import shutil
 import sys
 import time
@@ -32,7 +31,7 @@ from torchpose.export import (
     write_summary,
 )
 from torchpose.figures import plot_angles
-from torchpose.motion_export import ExportConfig, ExportFormat, export_motion
+from torchpose.motion_export import ExportConfig, export_motion
 from torchpose.parts import LabelledPoints, Parts, PersonParts
 from torchpose.people import People
 from torchpose.picture import draw_pictures
@@ -50,10 +49,6 @@ FEWEST = 5  # frames with a pose, from which somebody further is written
 SPACE = 60_000  # bytes that the parts and the files of a frame take, and some more
 _PARTS, _FILES = "parts", "files"  # folders of a run that is not finished
 _MOST_PROBLEMS = 4  # that are printed
-# Files that a run may write or not: those of people, by number, and in chosen formats.
-_OURS = re.compile(
-    rf"(poses|angles|person)(_\d+)?(_filtered)?\.(csv|npz|rrd|png|yaml|{'|'.join(kind.value for kind in ExportFormat)})"
-)
 
 
 class Session:
@@ -203,9 +198,8 @@ class Session:
         """Move the files into the output folder, and remove those of an earlier run that this one did not write."""
         files = sorted(staged.iterdir())
         names = {file.name for file in files}
-        for old in self.output.iterdir():
-            if _OURS.fullmatch(old.name) and old.name not in names:
-                old.unlink()
+        for name in _files_of(self.output) - names:
+            (self.output / name).unlink(missing_ok=True)
         for file in files:
             os.replace(file, self.output / file.name)
 
@@ -293,6 +287,15 @@ def kept_warnings() -> Iterator[list[str]]:
 
         warnings.showwarning = keep
         yield told
+
+
+def _files_of(output: Path) -> set[str]:
+    """The files that an earlier run wrote into a folder, by its summary."""
+    try:
+        files = json.loads((output / "summary.json").read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):  # none, or of an older version
+        return set()
+    return {name for name in files if isinstance(name, str) and Path(name).name == name}
 
 
 def is_interrupted(output: Path, settings: Mapping[str, Any], version: str) -> bool:
