@@ -1,6 +1,7 @@
 """The diary: activities, pauses, what was not learned and nobody at all, of any rate, all at once or live."""
 
 import itertools
+import json
 import math
 from datetime import datetime
 
@@ -210,6 +211,8 @@ def test_a_folder_of_poses_gets_its_activities_and_a_journal_its_entries(recogni
     write_poses_npz(tmp_path / "out" / "poses.npz", sequence(clip.pose.double()))
     write_poses_npz(tmp_path / "out" / "poses_2.npz", sequence(clip.pose.flip(0).double()))
     (tmp_path / "out" / "activities_3.csv").write_text("of an earlier run")
+    page = tmp_path / "out" / "report.html"
+    page.write_text('<script type="application/json" id="activities">[]</script>')
     started = datetime(2026, 11, 23, 11, 59, 50)
     writer = ActivityWriter(
         tmp_path / "recognizer", journal=tmp_path / "j.sqlite", person="anna", started=started
@@ -219,6 +222,8 @@ def test_a_folder_of_poses_gets_its_activities_and_a_journal_its_entries(recogni
     assert not (tmp_path / "out" / "activities_3.csv").exists()
     entries = read_activities_csv(tmp_path / "out" / "activities.csv")
     assert agreement(entries, labels) > 0.95
+    on_page = [[entry["activity"] for entry in person] for person in json.loads(page.read_text()[48:-9])]
+    assert on_page == [[entry.activity for entry in person] for person in found.values()]
     journal = Journal(tmp_path / "j.sqlite")
     assert journal.people() == ["anna", "anna_2"]
     before_noon = sum(

@@ -50,7 +50,7 @@ _QUALITIES = (85, 75, 60, 45, 30)  # of JPEG, until a picture is small enough
 _MISSING = np.iinfo(np.int16).min  # in place of a number that is not there
 _CHUNK = 512  # poses at once
 _PAGE = resources.files("torchpose") / "page"
-_SCRIPTS = ("scene.js", "plot.js", "page.js")
+_SCRIPTS = ("run.js", "scene.js", "plot.js", "page.js")
 _ACTIVITIES = '<script type="application/json" id="activities">'
 _MOST_SENTENCES = 200  # problems on the page; summary.json has all
 
