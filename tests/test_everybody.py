@@ -39,8 +39,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> File:
 @pytest.fixture(scope="module")
 def result(folder: File, tmp_path_factory: pytest.TempPathFactory) -> File:
     output = tmp_path_factory.mktemp("result")
-    for name in ("poses_3.csv", "poses_3.bvh"):
+    old = ("poses_3.csv", "poses_3.bvh")
+    for name in old:
         (output / name).write_text("an earlier run found a third one")
+    (output / "summary.json").write_text(json.dumps({"files": old}))
     assert infer_main([f"recording={folder}", f"output={output}", *QUICK]) == 0
     return output
 

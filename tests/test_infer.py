@@ -120,8 +120,10 @@ def test_full_precision_agrees_with_the_table(result: Path):
 
 def test_motion_is_written_for_other_programs_and_old_files_go(folder: Path, tmp_path: Path):
     """One frame, filtered; a BVH of a second person and a C3D are left by an earlier run."""
-    for old in ("poses_2.bvh", "poses.c3d", "poses_2_filtered.csv"):
-        (tmp_path / old).write_text("old")
+    old = ("poses_2.bvh", "poses.c3d", "poses_2_filtered.csv")
+    for name in old:
+        (tmp_path / name).write_text("old")
+    (tmp_path / "summary.json").write_text(json.dumps({"files": old}))
     command = [f"recording={folder}", f"output={tmp_path}", "max_frames=1", *QUICK]
     assert infer_main([*command, "export.formats=[mot,bvh]", "export.filter=rts"]) == 0
     names = {path.name for path in tmp_path.glob("poses*")}

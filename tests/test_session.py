@@ -152,7 +152,8 @@ def test_one_frame_is_enough(shown: tuple[Shown, torch.Tensor], tmp_path: Path):
     assert found.status == ("tracked",)
     assert misfit(found, truth[:1]).max() < 0.1
     assert {path.name for path in tmp_path.iterdir()} == {
-        *("poses.csv", "poses.npz", "person.yaml", "overlay.mp4", "angles.png", "summary.json")
+        *("poses.csv", "poses.npz", "poses.mot", "poses.trc", "poses.bvh"),
+        *("person.yaml", "overlay.mp4", "angles.png", "report.html", "summary.json"),
     }
 
 

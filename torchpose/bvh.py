@@ -63,7 +63,7 @@ def write_bvh(
         )
     rate = frame_rate(sequence)
     steady = resample(sequence, rate, gap)
-    steady = _rows(steady, longest_stretch(steady.answered))
+    steady = steady[longest_stretch(steady.answered)]
     root = _tree(body, size)
     order = list(_walk(root))
     lines = [
@@ -83,15 +83,6 @@ def write_bvh(
     with replacing(Path(path)) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
     return steady
-
-
-def _rows(sequence: PoseSequence, rows: slice) -> PoseSequence:
-    names = ("angle_names", "limb_angle_names")
-    cut = {
-        name: value if name in names or value is None else value[rows]
-        for name, value in vars(sequence).items()
-    }
-    return PoseSequence(**cut)
 
 
 def _tree(body: BodyModel, size: Float[Tensor, "1 sizes"]) -> _Node:

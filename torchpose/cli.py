@@ -253,6 +253,7 @@ def _open(config: InferConfig, output: Path) -> tuple[Recording, float | None]:
         config = _captured(config, output)
         assert config.recording is not None
         recording = open_recording(config.recording, config.right, config.calibration, config.background)
+    config.export.check_rate(recording.camera.frame_rate)
     require_writable(output)
     rows_before = None
     if config.align:

@@ -83,12 +83,19 @@ class PoseSequence:
     def __len__(self) -> int:
         return len(self.status)
 
-    def __getitem__(self, frames: slice, /) -> "PoseSequence":
-        """Some of the frames."""
-        names = ("angle_names", "limb_angle_names")
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        cut = {n: value if n in names or value is None else value[frames] for n, value in fields.items()}
-        return PoseSequence(**cut)
+    def __getitem__(self, frames: slice | Int[Tensor, " few"], /) -> "PoseSequence":
+        """Some of the frames, by a slice or by their positions."""
+        status = (
+            self.status[frames]
+            if isinstance(frames, slice)
+            else tuple(self.status[i] for i in frames.tolist())
+        )
+        cut = {
+            field.name: value[frames]
+            for field in dataclasses.fields(self)
+            if isinstance(value := getattr(self, field.name), Tensor)
+        }
+        return dataclasses.replace(self, status=status, **cut)
 
     @property
     def answered(self) -> tuple[bool, ...]:

@@ -1,11 +1,13 @@
 """The motion for other programs, beside `poses.csv`: which files, and what smooths them."""
 
+import math
 import warnings
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -80,6 +82,10 @@ def export_motion(
     Returns, for each file that may not hold every pose, which is the BVH, its first frame, its number of frames, and
     how many of the recording's frames with a pose it leaves out.
     """
+    later = sequence.time_s.cpu() > torch.cat(
+        [torch.tensor([-math.inf]), sequence.time_s.cpu().cummax(0)[0][:-1]]
+    )
+    sequence = sequence[later.nonzero()[:, 0]]  # other programs know one frame of a moment
     rate = usual_rate(sequence.time_s.double().numpy(force=True))
     if (
         config.filter is FilterKind.butterworth and config.cutoff >= rate / 2

@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,7 @@ class Report:
         rows = torch.from_numpy(self.samples[at] - start)
         if not len(rows):
             return
-        few = _rows(poses, rows).without_stale_numbers()
+        few = replace(poses, pose_covariance=None)[rows].without_stale_numbers()
         self._frame[at], self._time[at] = few.frame.numpy(), few.time_s.numpy()
         self._people[person].fill(at, few, self.body, self.sizes[person])
 
@@ -233,19 +233,6 @@ def add_activities(path: Path, people: Iterable[Sequence[Entry]]) -> None:
     with replacing(path) as partial:
         text = _json([[asdict(entry) for entry in entries] for entries in people])
         partial.write_text(before + mark + text + end + after, encoding="utf-8")
-
-
-def _rows(poses: PoseSequence, rows: Int[Tensor, " few"]) -> PoseSequence:
-    """Some frames of a sequence, without the covariance, which is most of it."""
-    taken: dict[str, Any] = {
-        "pose_covariance": None,
-        "status": tuple(poses.status[row] for row in rows.tolist()),
-    }
-    for field in fields(poses):
-        value = getattr(poses, field.name)
-        if field.name not in taken and isinstance(value, Tensor):
-            taken[field.name] = value[rows]
-    return replace(poses, **taken)
 
 
 def _spread(count: int, most: int) -> Int[np.ndarray, " few"]:
