@@ -78,20 +78,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
         *("export", "figures", "timeline", "journal", "activities"),
-        *(
-            "eyes",
-            "pipeline",
-            "window",
-            "people",
-            "parts",
-            "overlay",
-            "session",
-            "web_view",
-            "live",
-            "clips",
-            "study",
-            "cli",
-        ),
+        *("eyes", "pipeline", "window", "people", "parts", "overlay", "session"),
+        *("feed", "web_view", "live", "clips", "study", "cli"),
     ),
 }
 ORDER = [

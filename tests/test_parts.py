@@ -97,6 +97,7 @@ def test_a_run_goes_on_from_the_last_part_whose_first_person_is_there(parts: Par
             10, [Broken.of(later[0]), later[0]], [later[1]] * 2, [STATES | {"end": torch.tensor(10)}] * 2
         )
     assert set(parts.folder.rglob("*.npz")) > files
+    assert parts.path(1, "poses", 10).exists()  # the first person's are the last to be written
     assert parts.ends == [3, 4, 8]
     assert int(parts.states()[0]["end"]) == 8
     assert len(parts.person(1).sequence) == 8
