@@ -80,7 +80,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         *("export", "trajectory_filter", "resampling", "opensim", "bvh", "c3d_file", "motion_export"),
         *("figures", "timeline", "journal", "report", "rerun_log", "activities"),
         *("eyes", "pipeline", "window", "people", "parts", "overlay", "picture", "session"),
-        *("web_view", "feed", "live", "clips", "study", "cli"),
+        *("feed", "web_view", "live", "clips", "study", "cli"),
     ),
 }
 ORDER = [

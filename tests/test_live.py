@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import os
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -96,9 +98,9 @@ def camera(
 class Browser(threading.Thread):
     """Looks at the page as a browser does, lets somebody come in once the run is live, and ends it."""
 
-    def __init__(self, camera: ClockedCamera, follows: int, stops: bool = True) -> None:
+    def __init__(self, camera: ClockedCamera, follows: int, stops: bool = True, ctrl_c: bool = False) -> None:
         super().__init__(daemon=True)
-        self.camera, self.follows, self.stops = camera, follows, stops
+        self.camera, self.follows, self.stops, self.ctrl_c = camera, follows, stops, ctrl_c
         self.port = 0
         self.states: list[dict] = []
         self.page = self.image = b""
@@ -125,7 +127,10 @@ class Browser(threading.Thread):
                 self.camera.entered.set()
                 self.image = self.ask("/frame.jpg")[1]
                 if self.stops and state["followed"] >= self.follows:
-                    self.ask("/stop", "POST")
+                    if self.ctrl_c:
+                        os.kill(os.getpid(), signal.SIGINT)
+                    else:
+                        self.ask("/stop", "POST")
                     return
             time.sleep(0.02)
 
@@ -244,7 +249,7 @@ def test_whoever_ends_it_before_it_began_leaves_nothing(
 def test_files_that_could_not_be_written_are_written_by_the_same_command(
     camera: ClockedCamera, watched: list[Browser], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    browser = Browser(camera, follows=3)
+    browser = Browser(camera, follows=3, ctrl_c=True)
     watched.append(browser)
     browser.start()
     command = ["recording=camera:0", f"calibration={tmp_path / 'rig.yaml'}", f"output={tmp_path / 'out'}"]

@@ -90,7 +90,7 @@ class PoseSequence:
             if isinstance(frames, slice)
             else tuple(self.status[i] for i in frames.tolist())
         )
-        cut = {
+        cut: dict[str, Any] = {
             field.name: value[frames]
             for field in dataclasses.fields(self)
             if isinstance(value := getattr(self, field.name), Tensor)
