@@ -106,3 +106,27 @@ def test_the_equations_of_the_thesis_are_all_there_in_order():
     assert tags == [f"3.{n}" for n in range(1, 25) if f"3.{n}" not in prose]
     for number in prose:
         assert f"{number}" in (DOCS / "method.md").read_text() or number == "3.22"
+
+
+def test_fields_are_described_by_their_comments():
+    """The reference has what `--help` has: the comment behind a field, or above it, with its unit."""
+    pytest.importorskip("griffe", reason=EXTRA)
+    sys.path.insert(0, str(DOCS))
+    try:
+        from comment import comment_of
+    finally:
+        sys.path.remove(str(DOCS))
+    lines = [
+        "class A:",
+        "    # m, above,",
+        "    # in two lines",
+        "    a: float = 1.0",
+        "    b: tuple[float, float] = (",
+        "        1.0,  # px, low",
+        "        '#2',  # and high",
+        "    )",
+        "    c: int",
+    ]
+    assert comment_of(lines, 4, 4) == "m, above, in two lines"
+    assert comment_of(lines, 5, 8) == "px, low and high"
+    assert comment_of(lines, 9, 9) == ""
