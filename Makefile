@@ -27,8 +27,9 @@ test: $(VENV)/test.stamp  ## install, then lint, types and the fast tests
 test-slow: $(VENV)/test.stamp  ## install, then the tests that take longer
 	$(VENV)/bin/pytest -q -m slow
 
+# Strict counts warnings that it prints, so nothing may be --quiet; the variable hides an advertisement of Material's successor.
 docs: $(VENV)/docs.stamp  ## install, then build the documentation into site/, strictly and offline
-	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet  # else Material advertises its successor
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 	@echo "The documentation is in $(CURDIR)/site/index.html."
 
 figures: install  ## install, then draw the thesis's figures from recordings that the package makes itself
