@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OUTPUT, CACHE = Path("docs/figures/thesis"), Path("runs/figures")
+LARGEST = 140_000  # bytes of a file with all of its colours
 FRAMES = 45  # of the recordings of single joints, 10 a second
 HANDS_DOWN, HANDS_UP = 0, 11  # frames of the demonstration
 EXAMPLES = ("boxing", "elbow_horizontal")  # motions whose points are labelled
@@ -368,7 +369,10 @@ def draw(number: str, output: Path = OUTPUT, folder: Path = CACHE) -> Path:
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=100)
     with replacing(path) as partial:
-        image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
+        image, small = Image.open(drawn).convert("RGB"), io.BytesIO()
+        image.save(small, "PNG", optimize=True)
+        if len(small.getbuffer()) > LARGEST:  # fewer colours
+            image = image.quantize(256, Image.Quantize.MAXCOVERAGE)
         image.save(partial, "PNG", optimize=True)
     return path
 
