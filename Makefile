@@ -7,7 +7,7 @@ PIP_INSTALL := $(PYTHON) -m pip install -qq --disable-pip-version-check -c const
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow clean
+.PHONY: help install demo test test-slow docs figures clean
 
 help:  ## say what there is
 	@sed -n 's/^\([a-z-]*\):.*  ## /  make \1\t/p' Makefile | expand -t 20
@@ -27,8 +27,18 @@ test: $(VENV)/test.stamp  ## install, then lint, types and the fast tests
 test-slow: $(VENV)/test.stamp  ## install, then the tests that take longer
 	$(VENV)/bin/pytest -q -m slow
 
+# Strict counts warnings that it prints, so nothing may be --quiet; the variable hides an advertisement of Material's successor.
+docs: $(VENV)/docs.stamp  ## install, then build the documentation into site/, strictly and offline
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
+	@echo "The documentation is in $(CURDIR)/site/index.html."
+
+figures: install  ## install, then draw the thesis's figures from recordings that the package makes itself
+	$(PYTHON) -m benchmarks.figures
+	$(PYTHON) infer.py output=runs/demo
+	$(PYTHON) -m benchmarks.moving_figure runs/demo/overlay.mp4 docs/figures/demo.webp
+
 clean:  ## remove .venv and everything that installing, testing and running leave behind
-	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) runs site dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamps are newer than what they were made from, so make has nothing to do the second time.
@@ -47,4 +57,8 @@ $(VENV)/install.stamp: pyproject.toml constraints.txt | $(PYTHON)
 
 $(VENV)/test.stamp: $(VENV)/install.stamp
 	$(PIP_INSTALL) -e '.[test]'
+	@touch $@
+
+$(VENV)/docs.stamp: $(VENV)/install.stamp
+	$(PIP_INSTALL) -e '.[docs]'
 	@touch $@

@@ -14,7 +14,7 @@ import torch
 
 import torchpose as tp
 from torchpose import cli, session
-from torchpose.cli import CONFIGS, infer_main, load_config
+from torchpose.cli import CONFIGS, infer_main
 from torchpose.export import JOINT_NAMES, pose_columns
 from torchpose.recording import Backgrounds, write_recording
 from torchpose.synthesis.database import SyntheticRecording, make_recording, synthetic_camera
@@ -388,20 +388,3 @@ def test_a_missing_folder_and_an_unknown_setting_are_one_sentence(capsys: pytest
     assert "right must come with a recording, got none; give recording=PATH" in capsys.readouterr().err
     assert infer_main(["pose.registration.round=3"]) == 2
     assert "did you mean 'rounds'?" in capsys.readouterr().err
-
-
-def test_the_readme_s_commands_are_real():
-    """Every command of the README names a script, a benchmark or a target that exists, with settings that are known."""
-    root = CONFIGS.parent
-    readme = (root / "README.md").read_text()
-    commands = re.findall(r"^(?:OMP_NUM_THREADS=1 )?((?:python|make) .*?)(?:\s+#.*)?$", readme, re.M)
-    assert len(commands) >= 6
-    for command in commands:
-        words = command.split()
-        if words[0] == "make":
-            assert f"\n{words[1]}:" in (root / "Makefile").read_text(), command
-        elif words[1] == "-m":
-            assert (root / Path(*words[2].split("."))).with_suffix(".py").is_file(), command
-        else:
-            kind = words[1].removesuffix(".py")
-            load_config(kind, [word for word in words[2:] if "=" in word])  # raises for an unknown setting

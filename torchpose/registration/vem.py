@@ -256,7 +256,8 @@ class Registrar(nn.Module):
 
         Args:
             prior: what earlier frames say of the pose; None says nothing.
-            rounds, sigma_first: override the config, for a cold start.
+            rounds: overrides the config, for a cold start.
+            sigma_first: the same, m.
             covariance: as for `evaluate`.
         """
         if prior is None:
