@@ -16,7 +16,7 @@ install: $(VENV)/install.stamp  ## make .venv and install torchpose into it; qui
 
 demo: install  ## install, then recover the poses from a recording that the package makes itself
 	$(PYTHON) infer.py output=runs/demo
-	@echo "The results are in $(CURDIR)/runs/demo: poses.csv, overlay.mp4, angles.png and more."
+	@echo "The results are in $(CURDIR)/runs/demo: open report.html."
 
 test: $(VENV)/test.stamp  ## install, then lint, types and the fast tests
 	$(VENV)/bin/ruff check .
@@ -34,6 +34,7 @@ docs: $(VENV)/docs.stamp  ## install, then build the documentation into site/, s
 
 figures: install  ## install, then draw the thesis's figures from recordings that the package makes itself
 	$(PYTHON) -m benchmarks.figures
+	$(PYTHON) -m benchmarks.angle_figures
 	$(PYTHON) infer.py output=runs/demo
 	$(PYTHON) -m benchmarks.moving_figure runs/demo/overlay.mp4 docs/figures/demo.webp
 
