@@ -195,15 +195,13 @@ class TestExport:
             "problems": [],
             "others": [],
         }
-        for name in ("poses.csv", "poses.bvh", "poses_2.bvh"):
-            (tmp_path / name).touch()
-        lines = summary_table(summary | rest, tmp_path).splitlines()
+        files = {"files": ["poses.bvh", "poses.csv", "poses_2.bvh"]}
+        lines = summary_table(summary | rest | files, tmp_path, 200).splitlines()
         assert (
             "poses.bvh         holds the longest stretch of poses, 20 frames from 7 on; 10 poses are outside"
             in lines
         )
         assert not any(line.startswith("poses_2.bvh") for line in lines)
-        assert lines[-1].startswith(f"results           {tmp_path}/ poses.{{bvh,csv}}, person.yaml")
 
     def test_nothing_is_asked_for(self, body: BodyModel, size: torch.Tensor, tmp_path: Path) -> None:
         assert export_motion(tmp_path, "", moving(body, size), body, size, ExportConfig(formats=())) == {}

@@ -218,32 +218,26 @@ def test_a_limb_of_which_only_the_top_shows_turns_by_more_than_one_that_shows_in
     assert (sds[1][raised] > 2 * sds[0][raised]).all()
 
 
-def test_points_near_a_joint_alone_count_once_in_a_while_and_rest_in_every_frame_then(body, scene):
-    """With the legs hidden but for their tops: at twice the frame rate a frame says half as much of a thigh, as its
-    errors are those of the frame before; of an arm in full view it says as much as before.
-    """
+def test_points_near_a_joint_alone_say_little_of_the_limb(body, scene):
+    """With the legs hidden but for their tops, against equations in which every point counts."""
     pose, observation, _, _ = scene
     below = observation.cloud.points[..., 1] - body(pose).joints[:, 9:11, 1].mean(1)[:, None]
     cloud = replace(observation.cloud, mask=observation.cloud.mask & (below < 0.1))
     observation, size = replace(observation, cloud=cloud), body.default_size(1)
-    smoother = Smoother(body, Registrar(body, RegistrationConfig(rim=RimConfig(weight=0.0))))  # points alone
-
-    def each(rate):
-        equations = smoother._equations(observation, pose, size, torch.arange(6).double() / rate)
-        told = equations.of_rows(body(pose, size))[:, :-1, :-1].diagonal(dim1=1, dim2=2)
-        return told.mean(0), equations.prior.precision.mean(0)
-
-    slow, fast = each(10), each(20)
+    registrar = Registrar(body, RegistrationConfig(rim=RimConfig(weight=0.0)))  # points alone
+    smoother, posed = Smoother(body, registrar), body(pose, size)
+    found = smoother._equations(observation, pose, size, times(6)).of_rows(posed)
+    foot = registrar.correspond(posed, observation)
+    labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
+    rows, _ = registrar.rows(posed, foot, labelling, observation)
+    nothing = PosePrior(pose, torch.zeros_like(pose))
+    whole = equations_by_moments(body, size, rows, nothing, registrar.config.fitting, posed).of_rows(posed)
+    found, whole = (x[:, :-1, :-1].diagonal(dim1=1, dim2=2).mean(0) for x in (found, whole))
     thigh = [i for i, name in enumerate(body.parameter_names) if name.startswith("thigh")]
-    shank = [i for i, name in enumerate(body.parameter_names) if name.startswith("shank")]
-    assert (slow[0][thigh] > 0.1).all()  # there are points
-    assert_close(fast[0][thigh] / slow[0][thigh], torch.full((4,), 0.5).to(slow[0]), rtol=0, atol=0.1)
-    assert_close(fast[0][arm(body)], slow[0][arm(body)], rtol=0.15, atol=0)
-    # The pull to rest is whole on what is not seen, as if there were one frame, and is thinned out where all is.
-    alone = smoother._equations(observation, pose, size, torch.zeros(1).double()).prior.precision.mean(0)
-    assert_close(fast[1][shank], alone[shank], rtol=1e-6, atol=0)
-    assert (fast[1][thigh] > 0.8 * alone[thigh]).all()
-    assert (fast[1][arm(body)] < 0.4 * alone[arm(body)]).all()
+    assert (whole[thigh] > 1).all()
+    assert (found[thigh] < 0.01 * whole[thigh]).all()
+    assert (found[:6] > 0.4 * whole[:6]).all()
+    assert (found[arm(body)] > 0.3 * whole[arm(body)]).all()
 
 
 def test_unseen_frames_lie_between_their_neighbours_and_less_surely_the_farther_these_are():
@@ -495,7 +489,12 @@ def test_one_frame_alone_keeps_its_pose(body, scene):
     config = SmoothingConfig(rounds=12, offset_sd=0.0, slide_sd=0.0)
     smooth = Smoother(body, registrar, config)(one, times(1), found, body.default_size(1))
     assert miss(body, smooth.registration, pose[1:2]).max() < 0.02
-    assert_close(torch.linalg.inv(smooth.filtered), smooth.registration.covariance, rtol=1e-2, atol=1e-5)
+    # Feet and labels are renewed in between, which moves weights a little.
+    sds = [
+        x.diagonal(dim1=1, dim2=2).sqrt()
+        for x in (torch.linalg.inv(smooth.filtered), smooth.registration.covariance)
+    ]
+    assert_close(*sds, rtol=0.1, atol=0)
 
 
 def test_a_message_holds_the_first_frame_and_survives_its_state(body, scene):

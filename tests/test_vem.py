@@ -489,7 +489,8 @@ def test_without_a_compiler_registration_goes_on_with_one_warning(scene, monkeyp
     monkeypatch.setattr(torch, "compile", missing)
     vem.compiling_works.cache_clear()
     config = RegistrationConfig(compile=True)
-    with pytest.warns(UserWarning, match="compile=true needs a compiler, going on without: no g\\+\\+ here$"):
+    told = r"compile=true needs a compiler, going on without: no g\+\+ here; install one, or leave compile=false$"
+    with pytest.warns(UserWarning, match=told):
         registrar = Registrar(body, config)
     again = Registrar(body, config)  # no other warning
     vem.compiling_works.cache_clear()

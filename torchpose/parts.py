@@ -95,11 +95,11 @@ class Parts:
         sequences: Sequence[PoseSequence],
         points: Sequence[Sequence[LabelledPoints]],
         states: Sequence[Mapping[str, Tensor]],
-        depths: Sequence[UInt8[np.ndarray, " bytes"]] | None = None,
+        depths: Sequence[np.ndarray] | None = None,
     ) -> None:
         """One part of everybody, up to frame `end`: points, what the next frame starts from, and last the poses.
 
-        `depths` are the frames' depth images as PNG, where they are wanted later.
+        `depths` are the frames' depth images as PNG, uint8 of any length each, where they are wanted later.
         """
         if depths is not None:
             with replacing(self.path(0, "depth", end)) as partial:

@@ -247,17 +247,13 @@ class Smoother(nn.Module):
         labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
         rows, support = registrar.rows(posed, foot, labelling, observation, tangential=tangential)
         rest = registrar.with_rest(PosePrior(pose, torch.zeros_like(pose)), support)
+        rest = PosePrior(rest.mean, rest.precision * self._rest_share(time_s))
         equations = equations_by_moments(self.body, size, rows, rest, registrar.config.fitting, posed)
-        # Points near a limb's joint alone err alike from frame to frame: they count once in `rest_time`, as what an
-        # unseen limb is drawn to rest by does, and there this counts in every frame.
+        # Points near a limb's joint alone err alike, as surfaces are not quite the person's: many points in many frames
+        # say no more of its direction than one does, and must not outvote what the limb did before, or its rest.
         joints = posed.origins[:, self.body.carriers[: self.body.num_parts]]
-        shown, once = equations.of_rows.reach(posed, joints).square(), self._rest_share(time_s)
-        below = (shown[..., None] * self.body.part_moves.to(shown)).amax(1)  # of what each parameter moves
-        return replace(
-            equations,
-            of_rows=equations.of_rows.weighted(once + (1 - once) * shown),
-            prior=PosePrior(rest.mean, rest.precision * (1 - (1 - once) * below)),
-        )
+        weight = equations.of_rows.reach(posed, joints) ** 4
+        return replace(equations, of_rows=equations.of_rows.weighted(weight))
 
     def _covariance(
         self, equations: PoseEquations, pose: Float[Tensor, "frames parameters"], size: Tensor, chain: Chain
