@@ -24,8 +24,10 @@ python train.py experiment=skeleton data.path=FILE   a skeleton data set
 }
 FILES: dict[str, str] = {
     "infer": """
+report.html    the run on one page, for a browser: start with this
 poses.csv      a row a frame: joints in m, angles in degrees with standard deviations, status
 poses.npz      the same and more, in full precision
+poses.mot      and .trc for OpenSim, .bvh for Blender; export.formats= and export.filter=
 overlay.mp4    the model over the images
 angles.png     the joint angles over time, with bands of two standard deviations
 person.yaml    the person's sizes, for pose.person=FILE of a later run
