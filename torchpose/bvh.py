@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.atomic import replacing
 from torchpose.body.model import BodyModel, PosedBody
-from torchpose.export import PoseSequence
+from torchpose.export import PoseSequence, write_table
 from torchpose.resampling import frame_rate, longest_stretch, resample
 
 GAP = 0.25  # s; see `write_bvh`
@@ -79,9 +78,7 @@ def write_bvh(
     still = np.zeros((len(steady), 3))
     table = np.hstack([place, *(still if node.body is None else next(fixed) for node in order)])
     row = " ".join(["%.5f"] * table.shape[1])
-    lines += [row % tuple(values) for values in table.tolist()]
-    with replacing(Path(path)) as partial:
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+    write_table(path, lines, row, table)
     return steady
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -41,6 +41,7 @@ _FIRST_COLUMNS = ("frame", "time_s", "status", "point_to_model_m")
 _ROWS_AT_ONCE = 1024  # of a table, in memory as text or as copies
 _LOOK = 50  # frames, after which it is seen whether the disk is full
 _FULL_DISK = 2**20  # bytes; with fewer left a disk is taken to be full
+_ROWS = 4096  # of a table, that are Python's numbers at once
 _VIDEO_CODECS = ("mp4v", "avc1")  # OpenCV's own wheels have the first
 
 
@@ -272,6 +273,20 @@ def read_pose_sd(path: str | Path) -> Float[Tensor, "time parameters"] | None:
                 variance = torch.from_numpy(rows.reshape(count, size, size).copy()).diagonal(dim1=1, dim2=2)
                 found[start : start + count] = variance.clamp(min=0).sqrt()
     return found
+
+
+def write_table(
+    path: str | Path, head: Sequence[str], row: str, table: Shaped[np.ndarray, "rows columns"]
+) -> None:
+    """Write lines of text: those of `head`, then `row` filled with each row of numbers, some thousand at a time.
+
+    What is missing becomes NaN, as programs other than Python spell it.
+    """
+    with replacing(Path(path)) as partial, partial.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(line + "\n" for line in head)
+        for start in range(0, len(table), _ROWS):
+            few = table[start : start + _ROWS].tolist()
+            file.writelines((row % tuple(values)).replace("nan", "NaN") + "\n" for values in few)
 
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:

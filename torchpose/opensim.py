@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.atomic import replacing
 from torchpose.body.angle import ANATOMICAL_NAMES
-from torchpose.export import JOINT_NAMES, PoseSequence
+from torchpose.export import JOINT_NAMES, PoseSequence, write_table
 from torchpose.geometry import exp_rotation
 from torchpose.resampling import frame_rate
 from torchpose.trajectory_filter import stretches
@@ -115,7 +114,7 @@ def write_mot(path: str | Path, sequence: PoseSequence) -> None:
         "\t".join(names),
     ]
     row = "\t".join(["%.6f"] * len(names))
-    _write(path, [*head, *(row % tuple(values) for values in table.tolist())])
+    write_table(path, head, row, table)
 
 
 def write_trc(path: str | Path, sequence: PoseSequence) -> None:
@@ -133,8 +132,7 @@ def write_trc(path: str | Path, sequence: PoseSequence) -> None:
         "",
     ]
     row = "\t".join(["%d", "%.6f"] + ["%.3f"] * points.shape[1])
-    table = np.column_stack([clean.frame.numpy(), clean.time_s.numpy(), points])
-    _write(path, [*head, *((row % tuple(values)).replace("nan", "NaN") for values in table.tolist())])
+    write_table(path, head, row, np.column_stack([clean.frame.numpy(), clean.time_s.numpy(), points]))
 
 
 def _pelvis(sequence: PoseSequence, column: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -151,8 +149,3 @@ def _pelvis(sequence: PoseSequence, column: dict[str, np.ndarray]) -> tuple[np.n
     offset = (R @ torch.tensor(_PELVIS_ORIGIN, dtype=torch.float64)[:, None])[..., 0]
     place = to_opensim(sequence.joints[:, JOINT_NAMES.index("pelvis")]) + offset
     return torch.stack([tilt, bow, turn], -1).numpy(), place.numpy()
-
-
-def _write(path: str | Path, lines: list[str]) -> None:
-    with replacing(Path(path)) as partial:
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
