@@ -225,7 +225,8 @@ def test_the_turned_recording_is_empty_then_as_given_then_empty_again(shared_dat
     bare = recording[3].left
     assert bare is not None
     apart = (empty[0] - empty[1]).std()
-    assert 0.75 < float((bare - empty[0]).std() / apart) < 1.05  # JPEG, once more, takes away some of the noise
+    # JPEG, once more, takes away some of the noise.
+    assert 0.75 < float((bare - empty[0]).std() / apart) < 1.05
     # The way out: the truth's silhouette is where the picture is not the room.
     index = EMPTY + 60 + 20
     out = recording[index].left

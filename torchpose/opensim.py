@@ -5,6 +5,7 @@ scene to the camera. The origin stays in the left camera, and up is the camera's
 the Rajagopal (2016) model, which OpenCap's models share; docs/angles.md has the table.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,7 @@ _PELVIS_ORIGIN = (0.056276, 0.07849, 0.0)
 _BENT_BACK = np.deg2rad(
     10
 )  # an elbow or knee that is bent back by less is straight or a little over, as in OpenSim's ranges
+_CHUNK = 4096  # frames turned at once
 _MM = 1000.0
 
 
@@ -84,7 +86,7 @@ def write_mot(path: str | Path, sequence: PoseSequence) -> None:
         raise ValueError(
             f"angle_names must have all anatomical angles for a .mot file, {missing[0]} is missing; give them all"
         )
-    clean = sequence.without_stale_numbers()
+    clean = replace(sequence, pose=None, pose_covariance=None).without_stale_numbers()
     column = dict(zip(clean.angle_names, clean.angles.numpy().T, strict=True))
     for joint, above in (("knee_flexion", "hip_rotation"), ("elbow_flexion", "shoulder_rotation")):
         for side in ("left", "right"):
@@ -98,7 +100,8 @@ def write_mot(path: str | Path, sequence: PoseSequence) -> None:
     whole = np.isfinite(table).all(1)
     time, table = clean.time_s.numpy(), table.copy()
     for run in stretches(whole, time):
-        table[run, : angles.shape[1]] = np.rad2deg(np.unwrap(angles[run], axis=0))
+        for i in range(angles.shape[1]):  # all at once take copies of a long run's whole table
+            table[run, i] = np.rad2deg(np.unwrap(angles[run, i]))
     table = np.column_stack([time, table[:, :3], table[:, -3:], table[:, 3:-3]])[whole]
     names = ["time", *PELVIS, *(theirs for _, theirs, _ in COORDINATES)]
     head = [
@@ -140,12 +143,25 @@ def _pelvis(sequence: PoseSequence, column: dict[str, np.ndarray]) -> tuple[np.n
 
     Ours turns first, then bends (R = Ry Rx Rz); OpenSim's pelvis tilts about z, lists about x, then turns about y.
     """
+    pieces = [
+        _pelvis_of(
+            torch.stack([torch.from_numpy(column[name][start : start + _CHUNK]) for name in _TRUNK], -1),
+            sequence.joints[start : start + _CHUNK, JOINT_NAMES.index("pelvis")],
+        )
+        for start in range(0, max(len(sequence), 1), _CHUNK)
+    ]
+    turns, places = zip(*pieces, strict=True)
+    return torch.cat(turns).numpy(), torch.cat(places).numpy()
+
+
+def _pelvis_of(
+    angles: Float[Tensor, "time 3"], pelvis: Float[Tensor, "time 3"]
+) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time 3"]]:
     axes = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=torch.float64)
-    angles = torch.stack([torch.from_numpy(column[name]) for name in _TRUNK], -1)
     yaw, pitch, roll = exp_rotation(angles[..., None] * axes).unbind(-3)
     R = (yaw @ pitch @ roll).flip(-1).flip(-2)  # both frames are turned alike, and the two signs cancel
     tilt, bow = torch.atan2(-R[:, 0, 1], R[:, 1, 1]), torch.asin(R[:, 2, 1].clamp(-1, 1))
     turn = torch.atan2(-R[:, 2, 0], R[:, 2, 2])
     offset = (R @ torch.tensor(_PELVIS_ORIGIN, dtype=torch.float64)[:, None])[..., 0]
-    place = to_opensim(sequence.joints[:, JOINT_NAMES.index("pelvis")]) + offset
-    return torch.stack([tilt, bow, turn], -1).numpy(), place.numpy()
+    place = to_opensim(pelvis) + offset
+    return torch.stack([tilt, bow, turn], -1), place
