@@ -162,6 +162,7 @@ class TestTrc:
         rows = np.arange(24) != 5
         np.testing.assert_allclose(table[rows, 2:], expected[rows], atol=6e-4)
         assert np.isnan(table[5, 2:]).all()
+        assert set(lines[11][2:]) == {"NaN"}  # as programs other than Python spell it
 
     def test_the_axes_are_right_handed(self) -> None:
         assert torch.linalg.det(to_opensim(torch.eye(3))) == pytest.approx(1)
