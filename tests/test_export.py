@@ -180,23 +180,17 @@ def test_npz_keeps_everything_in_full_precision(tmp_path: Path, sequence: PoseSe
     assert read_poses_npz(path).pose is None
 
 
-def test_parts_join_in_order(sequence: PoseSequence):
-    def rows(start: int, stop: int) -> PoseSequence:
-        return PoseSequence(
-            **{
-                field.name: value if field.name in ("angle_names", "limb_angle_names") else value[start:stop]
-                for field in dataclasses.fields(sequence)
-                for value in [getattr(sequence, field.name)]
-            }
-        )
-
-    joined = PoseSequence.join([rows(0, 1), rows(1, 4), rows(4, 6)])
+@pytest.mark.parametrize(("frames", "rows"), [(slice(1, 4), [1, 2, 3]), (torch.tensor([4, 0]), [4, 0])])
+def test_some_frames_of_a_sequence(sequence: PoseSequence, frames: slice | torch.Tensor, rows: list[int]):
+    some = sequence[frames]
     for field in dataclasses.fields(sequence):
-        value, expected = getattr(joined, field.name), getattr(sequence, field.name)
-        assert torch.equal(value, expected) if isinstance(value, torch.Tensor) else value == expected
-    other = dataclasses.replace(rows(1, 4), angle_names=("a", "b"))
-    with pytest.raises(ValueError, match="angle_names must be the same in all parts"):
-        PoseSequence.join([rows(0, 1), other])
+        value, whole = getattr(some, field.name), getattr(sequence, field.name)
+        if isinstance(whole, torch.Tensor):
+            assert torch.equal(value, torch.stack([whole[row] for row in rows]))
+        elif field.name == "status":
+            assert value == tuple(whole[row] for row in rows)
+        else:
+            assert value == whole
 
 
 @pytest.mark.parametrize(

@@ -104,25 +104,6 @@ class PoseSequence:
         posed = self.joints.isfinite().flatten(1).any(1).tolist()  # whoever is entering may have none yet
         return tuple(p and status not in EMPTY_STATUSES for p, status in zip(posed, self.status, strict=True))
 
-    @classmethod
-    def join(cls, parts: Sequence["PoseSequence"]) -> "PoseSequence":
-        """One sequence of several, in their order; all have the same names and the same optional fields."""
-        first = parts[0]
-        joined: dict[str, Any] = {}
-        for field in dataclasses.fields(cls):
-            values = [getattr(part, field.name) for part in parts]
-            if field.name in ("angle_names", "limb_angle_names"):
-                if any(value != values[0] for value in values):
-                    raise ValueError(
-                        f"{field.name} must be the same in all parts, got {values}; compute them alike"
-                    )
-                joined[field.name] = values[0]
-            elif field.name == "status":
-                joined[field.name] = tuple(status for value in values for status in value)
-            else:
-                joined[field.name] = None if getattr(first, field.name) is None else torch.cat(values)
-        return PoseSequence(**joined)
-
     def of_nobody(self) -> "PoseSequence":
         """The same frames of somebody who is not there."""
         empty = dataclasses.replace(self, status=("absent",) * len(self))

@@ -82,7 +82,6 @@ class Overlay:
     joints: Float[Tensor, "15 2"] | None = None  # px, in the order of `JOINT_NAMES`
     points: Float[Tensor, "num 2"] | None = None  # px
     labels: Int[Tensor, " num"] | None = None  # the part of each point; anything but 0 to 13 is none
-    text: tuple[str, ...] = ()  # lines below the status; plain ASCII
     row: int = 0  # in which the status stands: several people are drawn one after the other
     name: str = ""  # above the head
     marks: tuple[tuple[str, str], ...] = ()  # joint and what stands beside it
@@ -324,14 +323,9 @@ def _draw_marks(canvas: np.ndarray, overlay: Overlay, unit: float) -> None:
 
 
 def _draw_text(canvas: np.ndarray, overlay: Overlay, unit: float) -> None:
-    for row, line in enumerate((overlay.status, *overlay.text), overlay.row):
-        colour = (
-            STATUS_COLOURS.get(line.rpartition(" ")[2], (255, 255, 255))
-            if row == overlay.row
-            else (255, 255, 255)
-        )
-        origin = (8 * unit, 17 * unit * (row + 1.1))
-        _write(canvas, line, origin, 0.48 * unit, colour, round(unit), True)
+    colour = STATUS_COLOURS.get(overlay.status.rpartition(" ")[2], (255, 255, 255))
+    origin = (8 * unit, 17 * unit * (overlay.row + 1.1))
+    _write(canvas, overlay.status, origin, 0.48 * unit, colour, round(unit), True)
 
 
 def _write(

@@ -133,11 +133,6 @@ class Location:
         """Middle of the trunk, m."""
         return self._part(BODY)
 
-    @property
-    def body_velocity(self) -> Gaussian:
-        """m/s."""
-        return self._part(BODY_VELOCITY)
-
     def _part(self, part: slice) -> Gaussian:
         return Gaussian(self.mean[..., part], self.covariance[..., part, part])
 
