@@ -238,10 +238,10 @@ def test_the_whole_help_has_every_setting_once_under_a_heading(kind: Kind):
 
 @pytest.mark.parametrize("kind", ["infer", "train"])
 def test_the_commands_in_the_help_are_real(kind: Kind):
-    for line in help_text(kind).splitlines():
-        if line.startswith(f"  python {kind}.py"):
-            words = re.split(r"\s{2,}", line.strip())[0].split()[2:]
-            load_config(kind, words)
+    commands = [line for line in help_text(kind).splitlines() if line.startswith(f"  python {kind}.py")]
+    assert len(commands) >= 3
+    for line in commands:
+        load_config(kind, re.split(r"\s{2,}", line.strip())[0].split()[2:])  # raises for an unknown one
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def read_mot(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     keys = dict(line.split("=", 1) for line in head.splitlines() if "=" in line)
     names, *rows = (line.split("\t") for line in text.splitlines())
     table = np.array(rows, dtype=float).reshape(len(rows), len(names))
-    assert int(keys["nRows"]), int(keys["nColumns"]) == table.shape
+    assert (int(keys["nRows"]), int(keys["nColumns"])) == table.shape
     return keys, dict(zip(names, table.T, strict=True))
 
 
