@@ -194,14 +194,19 @@ def foot_of_part(
     Args:
         steps: of Newton's method; with `NEWTON_STEPS` as exact as `foot_point`.
     """
-    _, F, N = part.shape
-    every = torch.cat([posed.frames.flatten(2), posed.centers, _shapes(posed, visible)], -1).mT
-    index = part.flatten(1)[:, None].expand(-1, every.shape[1], -1)
-    own = every.gather(2, index).unflatten(2, (F, N)).transpose(1, 2)  # (B, F, numbers, N)
-    frames, centers, shapes = own.tensor_split((9, 12), 2)
+    numbers = torch.cat([posed.frames.flatten(2), posed.centers, _shapes(posed, visible)], -1)
+    frames, centers, shapes = _of_each(numbers, part).tensor_split((9, 12), 2)
     away = points.mT[:, None] - centers
     local = (frames.unflatten(2, (3, 3)) * away[:, :, :, None]).sum(2)
     return _foot_point(local, shapes, visible, steps)
+
+
+def _of_each(
+    numbers: Float[Tensor, "batch parts numbers"], part: Int[Tensor, "batch few num"]
+) -> Float[Tensor, "batch few numbers num"]:
+    """The numbers of the parts that each point has, with the points last in memory."""
+    index = part.flatten(1)[:, None].expand(-1, numbers.shape[2], -1)
+    return numbers.mT.gather(2, index).unflatten(2, part.shape[1:]).transpose(1, 2)
 
 
 def _foot_point(
@@ -340,14 +345,14 @@ def unflattened(
     back: Float[Tensor, "batch parts 3 3"],
 ) -> FootPoint:
     """Foot points on the parts of a `flattened` body as those of the body itself, each in its ellipsoid's frame."""
-    few = part.shape
     numbers = torch.cat([back.flatten(2), posed.frames.flatten(2), posed.centers, posed.radii], -1)
-    own = numbers.gather(1, part.flatten(1)[..., None].expand(-1, -1, 24)).view(*few, 24)
-    turn, frames, center, radii = own.split((9, 9, 3, 3), -1)
-    local = (turn.unflatten(-1, (3, 3)) @ foot.local[..., None])[..., 0]
-    place = (frames.unflatten(-1, (3, 3)).mT @ (points[:, None] - center)[..., None])[..., 0]
-    normal = torch.nn.functional.normalize(local / radii**2, dim=-1)
-    return FootPoint(local, normal, place - local, foot.hidden)
+    turn, frames, centers, radii = _of_each(numbers, part).tensor_split((9, 18, 21), 2)
+    local = (turn.unflatten(2, (3, 3)) * foot.local.mT[:, :, None]).sum(3)
+    away = points.mT[:, None] - centers
+    place = (frames.unflatten(2, (3, 3)) * away[:, :, :, None]).sum(2)
+    gradient = local / radii**2
+    normal = gradient * gradient.square().sum(2, keepdim=True).rsqrt()
+    return FootPoint(local.mT, normal.mT, (place - local).mT, foot.hidden)
 
 
 def algebraic_distance(
