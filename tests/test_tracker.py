@@ -399,6 +399,28 @@ def test_two_together_are_followed_as_each_alone(body, second):
                 assert_close(both[k].registration.pose, one.registration.pose, rtol=0, atol=2e-3)
 
 
+@pytest.mark.parametrize(("ago", "joins"), [(0.2, False), (0.3, True)])
+def test_limbs_that_are_sought_soon_anyway_are_sought_with_somebody_elses(body, monkeypatch, ago, joins):
+    """The first has looked around long ago, the second `ago` s before: of half a second."""
+    registration = RegistrationConfig()
+    registrar, starter = Registrar(body, registration), Starter(body, StartConfig(), registration)
+    config = replace(CONFIG, look_around=0.5, stray_share=0.9)
+    size, sought = body.size_of_height(1.7), []
+    refresh = starter.refresh
+    monkeypatch.setattr(starter, "refresh", lambda *given: sought.append(len(given[1])) or refresh(*given))
+    trackers = [Tracker(body, config, registrar, starter) for _ in range(2)]
+    for tracker, looked in zip(trackers, (-9.0, -ago), strict=True):
+        tracker.begin(moving(body, 0.0), -0.1)
+        tracker._looked = looked
+    seen = see(body, moving(body, 0.0), size, num=150)
+    track_together([Sought(one, 0.0, seen.observation(), seen.no_face(), size) for one in trackers])
+    assert sought == [1 + joins]
+    sought.clear()
+    trackers[0]._looked = trackers[1]._looked = -0.3  # due for neither: none is sought
+    track_together([Sought(one, 0.1, seen.observation(), seen.no_face(), size) for one in trackers])
+    assert sought == []
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [

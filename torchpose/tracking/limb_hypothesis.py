@@ -239,7 +239,7 @@ class _Work:
         known = self._known(pose, new)
         raw = self._cost(pose, place, new, known)
         few = Table(place, raw).best(config.fits, config.apart, torch.inf)
-        open_ = few.cost < table.cost[..., :1] + 4 * config.hopeless
+        open_ = few.cost < table.cost[..., :1] + 2 * config.hopeless
         frame, limb, slot = open_.nonzero(as_tuple=True)
         fitted = few.place.clone()
         start = pose[frame].scatter(1, self.limbs[limb], few.place[frame, limb, slot])

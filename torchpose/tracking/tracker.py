@@ -50,7 +50,7 @@ class TrackingConfig:
     search_slack: float = (
         3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
     )
-    look_around: float = 0.25  # s after which limbs are sought elsewhere although nothing seems wrong
+    look_around: float = 0.5  # s after which limbs are sought elsewhere although nothing seems wrong
     memory: float = 2.0  # s after which a lost person is forgotten
 
     def __post_init__(self) -> None:
@@ -202,7 +202,7 @@ class Tracker(nn.Module):
         return TrackedFrame(TrackStatus.partial if person.cut else TrackStatus.tracked, found)
 
     def seeks_limbs(self, person: "Sought", found: Registration) -> bool:
-        """Whether limbs are to be sought elsewhere than a registration has them."""
+        """Whether limbs must be sought elsewhere than a registration has them."""
         stray = self._stray(found)
         # Points that stayed without a part after a search (a bag, a skirt) are no reason for another one at once.
         strayed = stray > max(self.config.stray_share, 1.5 * self._known_stray)
@@ -211,6 +211,10 @@ class Tracker(nn.Module):
             return True
         self._known_stray = min(self._known_stray, stray)
         return False
+
+    def looks_soon(self, person: "Sought") -> bool:
+        """Whether limbs are to be sought soon anyway: with somebody else's that costs less than alone."""
+        return person.time_s - self._looked >= self.config.look_around / 2
 
     def end_frame(self, person: "Sought", found: Registration, other: Registration | None) -> TrackedFrame:
         """The answer, from a registration, and from the `other` one if limbs were sought: where a limb moved too fast
@@ -312,7 +316,9 @@ def track_together(people: Sequence[Sought]) -> list[TrackedFrame]:
     )
     best = both.score.nan_to_num(nan=torch.inf).view(-1, 2).argmin(1)
     found = [both.take(2 * row + which) for row, which in zip(rows.split(1), best.split(1), strict=True)]
-    seeking = [k for k, (person, _, _) in enumerate(going) if person.tracker.seeks_limbs(person, found[k])]
+    must = [person.tracker.seeks_limbs(person, found[k]) for k, (person, _, _) in enumerate(going)]
+    soon = [person.tracker.looks_soon(person) for person, _, _ in going]
+    seeking = [k for k in range(len(going)) if must[k] or (any(must) and soon[k])]
     others: dict[int, Registration] = {}
     if seeking:
         some = rows[seeking]
