@@ -36,6 +36,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "background",
         "empty_scene",
         "scene_match",
+        "floor",
         "silhouette",
         "focal_length",
         "points",

@@ -7,10 +7,14 @@ import torch
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
+from torchpose.eyes import Sight
 from torchpose.people import People, PeopleConfig, _at_border
 from torchpose.pipeline import RIM, StereoToPose
 from torchpose.tracking.location import sighting
 from torchpose.vision.camera import StereoCamera
+from torchpose.vision.faces import Faces
+from torchpose.vision.floor import Floor
+from torchpose.vision.points import PointCloud
 
 CAMERA = StereoCamera(160, 120, 150.0, 80.0, 60.0, 0.12, 10.0)
 
@@ -62,10 +66,51 @@ def test_the_height_is_the_second_tallest_of_upright_sights(people):
     H = model.body.height
     assert model.height_of([]) == H
     assert model.height_of([0.6 * H, 0.7 * H]) == H  # sitting
-    assert model.height_of([float("nan"), 0.8 * H]) == model.config.least_height
-    assert_close(model.height_of([1.70, 0.7 * H]), 1.70 + RIM)
-    assert_close(model.height_of([1.70, 1.72, 1.95]), 1.72 + RIM)
+    assert model.height_of([math.nan, 0.8 * H]) == 0.8 * H
+    assert model.height_of([1.70, 0.7 * H]) == 1.70
+    assert model.height_of([1.70, 1.72, 1.95]) == 1.72
     assert model.height_of([3.0, 3.0]) == 1.2 * H
+
+
+def upright(crown, lowest, lean=0.0):
+    """A sight of a column of points from a height over the floor to another, 1.1 m below a camera that looks down by
+    `lean` rad."""
+    height = torch.linspace(lowest, crown, 400)
+    level = torch.stack([torch.full_like(height, 0.1), 1.1 - height, torch.full_like(height, 3.0)], -1)
+    cos, sin = math.cos(lean), math.sin(lean)
+    turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
+    points = (level @ turn.mT)[None]
+    n = points.shape[1]
+    none = torch.zeros(1, n, dtype=torch.long)
+    cloud = PointCloud(
+        points,
+        points[..., :2],
+        none[..., None].expand(-1, -1, 2),
+        none == 0,
+        none[..., None].expand(-1, -1, 8),
+    )
+    picture = torch.zeros(1, 120, 160)
+    nothing = torch.full((1, 4), torch.nan)
+    faces = Faces(nothing, nothing[:, 0] > 0, picture > 0, nothing[:, :3])
+    sight = Sight(picture[:, None].expand(-1, 3, -1, -1), picture, picture > 0, cloud, faces, True, False)
+    return sight, Floor(torch.tensor([0.0, -cos, -sin]), torch.tensor(1.1))
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.3])
+@pytest.mark.parametrize("lowest", [0.0, 0.25, 0.9])
+def test_somebody_reaches_from_the_floor_to_the_crown(people, monkeypatch, lowest, lean):
+    """However little of feet and legs is seen, and however the camera looks down."""
+    sight, floor = upright(1.75, lowest, lean)
+    monkeypatch.setattr(people.model.eyes, "floor", floor)
+    assert_close(people.model.height_in(sight), 1.75 + RIM, atol=0.02, rtol=0)
+
+
+def test_without_a_floor_feet_may_be_missing(people, monkeypatch):
+    monkeypatch.setattr(people.model.eyes, "floor", None)
+    height = people.model.height_in
+    assert_close(height(upright(1.80, 0.0)[0]), 1.80 + 2 * RIM, atol=0.04, rtol=0)
+    assert height(upright(1.75, 0.2)[0]) == people.model.config.least_height
+    assert height(upright(1.75, 0.9)[0]) < 1.0  # sits: this says nothing of the height
 
 
 def test_the_sides_of_the_image_are_where_people_come_in():

@@ -38,6 +38,7 @@ from torchpose.vision.empty_scene import (
     stands_in_background,
 )
 from torchpose.vision.faces import FaceConfig, FaceDetector, FaceMemory, Faces
+from torchpose.vision.floor import Floor, FloorConfig, find_floor
 from torchpose.vision.growing_seeds import GrowingSeeds
 from torchpose.vision.photometry import temporal_median
 from torchpose.vision.points import PointCloud, SamplingConfig, sample_grid
@@ -66,6 +67,7 @@ class EyesConfig:
     empty_scene: EmptySceneConfig = field(default_factory=EmptySceneConfig)
     depth_background: DepthBackgroundConfig = field(default_factory=DepthBackgroundConfig)
     scene_match: SceneMatchConfig = field(default_factory=SceneMatchConfig)
+    floor: FloorConfig = field(default_factory=FloorConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
     memory: float = 0.5  # s, for which the last frame's silhouette tells which part of this one is the person
     stereo: StereoConfig = field(default_factory=StereoConfig)
@@ -157,6 +159,7 @@ class Eyes(nn.Module):
         self.stopwatch = Stopwatch()
         self.background: BackgroundModel | DepthBackground | None = None
         self.background_depth: Tensor | None = None
+        self.floor: Floor | None = None
         self.scene_match: SceneMatch | None = None
         self.last: LastSight | None = None
 
@@ -220,6 +223,7 @@ class Eyes(nn.Module):
                 config = replace(config, drift=1.0)  # the frames are spread over all of the recording's
             self.background = DepthBackground(depth.to(device), config)
             self.background_depth = self.background.depth
+            self.floor = find_floor(self.background_depth, self.camera, self.depth_noise, self.config.floor)
             return
         span, rules = (0, self.disparity_range[1]), self.config.empty_scene
         left, right = backgrounds.left, backgrounds.right
@@ -244,6 +248,7 @@ class Eyes(nn.Module):
         disparity = bridge_gaps(disparity)  # a bare wall and a glaring floor match nowhere but at their rims
         self.background = BackgroundModel(left, self.config.background)
         self.background_depth = self.camera.depth(disparity)
+        self.floor = find_floor(self.background_depth, self.camera, self.depth_noise, self.config.floor)
         empty = rgb_to_grayscale(torch.stack([temporal_median(left), temporal_median(right)]))[:, 0]
         self.scene_match = SceneMatch(empty[0], empty[1], disparity, self.config.scene_match)
 

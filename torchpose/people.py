@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 from torchpose.body.model import PosedBody
 from torchpose.export import JOINT_NAMES
 from torchpose.eyes import Sight, View
-from torchpose.pipeline import FramePose, StereoToPose, upright_extent
+from torchpose.pipeline import FramePose, StereoToPose
 from torchpose.recording import Frame, Recording, UnreadableFrame
 from torchpose.registration.vem import Observation, Registration
 from torchpose.tracking.kalman import Gaussian
@@ -114,14 +114,14 @@ class Follower:
         self.sized = sized
         # s, and m to the right and away, of the trunk in the last `WALK` s
         self.trail: Float[Tensor, "places 3"] = torch.zeros(0, 3, dtype=torch.float64)
-        self.extents: list[float] = []  # m, from head to foot in frames that show all of the person
+        self.heights: list[float] = []  # m, in frames that show all of the person
         self.samples: list[tuple[float, Observation, Registration]] = []  # for the size
 
     def state(self) -> dict[str, Tensor]:
         """What the next frame starts from, as tensors."""
         numbers = torch.tensor([self.seen, self.known, self.sized, self.face_time], dtype=torch.float64)
         state = self.model.state() | {"follower": numbers}
-        state |= {"trail": self.trail, "extents": torch.tensor(self.extents, dtype=torch.float64)}
+        state |= {"trail": self.trail, "heights": torch.tensor(self.heights, dtype=torch.float64)}
         state |= {f"location_{name}": value for name, value in self.location.state().items()}
         if self.clothes is not None:
             state["clothes"] = self.clothes
@@ -142,7 +142,7 @@ class Follower:
             if name.startswith("location_")
         }
         self.location = Location.restore(where)
-        self.trail, self.extents = state["trail"], state["extents"].tolist()
+        self.trail, self.heights = state["trail"], state["heights"].tolist()
         self.clothes = state["clothes"].to(like) if "clothes" in state else None
         self.face = None
         if "face" in state:
@@ -367,9 +367,9 @@ class People:
         """A first size from frames that show all of the person, until frames with poses tell it better."""
         if follower.sized or sight.cut or self.model.config.height or self._half_hidden(sight, view):
             return
-        follower.extents.append(upright_extent(sight))
-        if len(follower.extents) >= WHOLE:
-            height = follower.model.height_of(follower.extents)
+        follower.heights.append(follower.model.height_in(sight))
+        if len(follower.heights) >= WHOLE:
+            height = follower.model.height_of(follower.heights)
             follower.model.size = self.model.body.size_of_height(height)
 
     def _half_hidden(self, sight: Sight, view: View) -> bool:

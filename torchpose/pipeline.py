@@ -47,7 +47,9 @@ from torchpose.tracking.tracker import Tracker, TrackingConfig, TrackStatus
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import CellConfig, group_cells
 
-RIM = 0.03  # m by which a cloud falls short of a person: half a step of its grid at the head and at the feet
+RIM = (
+    0.015  # m by which a cloud falls short of a person at the head, and at the feet: half a step of its grid
+)
 SITTING = 0.76  # of the body file's height: whoever looks shorter sits or stoops
 WHOLE_SIGHTS = 2  # of all of somebody, that tell the size
 
@@ -183,8 +185,8 @@ class StereoToPose(nn.Module):
         """
         size = known
         if size is None:
-            extents = [upright_extent(sight) for sight in sights if sight.present and not sight.cut]
-            size = self.body.size_of_height(self.config.height or self.height_of(extents))
+            heights = [self.height_in(sight) for sight in sights if sight.present and not sight.cut]
+            size = self.body.size_of_height(self.config.height or self.height_of(heights))
         if self.config.size.rounds == 0 and self.config.colour.strength == 0:
             return size
         self.colour.forget()
@@ -223,17 +225,33 @@ class StereoToPose(nn.Module):
         if self.config.colour.strength > 0 and sight.coloured:
             self.colour.learn(self.evidence(sight), found.belief, found.distance)
 
-    def height_of(self, extents: Sequence[float]) -> float:
-        """The person's height, m, from the `upright_extent` of whole sights.
+    def height_in(self, sight: Sight) -> float:
+        """How tall somebody is in a sight, m: NaN where no point lies below the head.
+
+        From the head's top down to the floor. Where no floor is seen, down to the lowest point: feet that cannot be
+        told from the floor are missing then, so it is `least_height` at least.
+        """
+        points = sight.cloud.points[0][sight.cloud.mask[0]]
+        center = sight.faces.position[0, 0] if bool(sight.faces.found[0]) else points.median(0).values[0]
+        column = points[(points[:, 0] - center).abs() < 0.12]  # raised hands are beside the head
+        if not len(column):
+            return math.nan
+        if self.eyes.floor is not None:
+            return float(torch.quantile(self.eyes.floor.above(column), 0.99)) + RIM
+        extent = torch.quantile(points[:, 1], 0.99) - torch.quantile(column[:, 1], 0.01)
+        least = self.config.least_height if float(extent) > SITTING * self.body.height else 0.0
+        return max(float(extent) + 2 * RIM, least)
+
+    def height_of(self, heights: Sequence[float]) -> float:
+        """The person's height, m, from those in several sights.
 
         Whoever stoops looks shorter, never taller, so of three or more the second tallest counts (the tallest may
         hold a stray point). Without any that may be somebody upright it is the body file's height.
         """
-        heights = sorted(one + RIM for one in extents if one + RIM > SITTING * self.body.height)
-        if not heights:
+        tall = sorted(one for one in heights if one > SITTING * self.body.height)
+        if not tall:
             return self.body.height
-        measured = heights[-2] if len(heights) > 2 else heights[-1]
-        return min(max(measured, self.config.least_height), 1.2 * self.body.height)
+        return min(tall[-2] if len(tall) > 2 else tall[-1], 1.2 * self.body.height)
 
     def forward(self, recording: Recording) -> Iterator[FramePose]:
         """Poses of a prepared recording's frames, in order and smoothed."""
@@ -383,14 +401,3 @@ class SmoothingWindow:
         self.waiting = self.waiting[count:]
         self.state = self._next | ({} if self.before is None else self.before.state())
         return [replace(frame, observation=None) for frame in smooth[:count]]
-
-
-def upright_extent(sight: Sight) -> float:
-    """From the head's top down to the lowest point, m; NaN where no point lies below the head."""
-    points = sight.cloud.points[0][sight.cloud.mask[0]]
-    middle = points.median(0).values
-    center = sight.faces.position[0, 0] if bool(sight.faces.found[0]) else middle[0]
-    column = points[(points[:, 0] - center).abs() < 0.12, 1]  # raised hands are beside the head
-    if not len(column):
-        return math.nan
-    return float(torch.quantile(points[:, 1], 0.99) - torch.quantile(column, 0.01))
