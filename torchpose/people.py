@@ -364,8 +364,16 @@ class People:
         return best
 
     def _measure_height(self, follower: Follower, sight: Sight, view: View) -> None:
-        """A first size from frames that show all of the person, until frames with poses tell it better."""
-        if follower.sized or sight.cut or self.model.config.height or self._half_hidden(sight, view):
+        """A first size from frames that show head and feet, until frames with poses tell it better; from the head alone
+        where the floor is known."""
+        if follower.sized or self.model.config.height:
+            return
+        own = sight.silhouette[0]
+        if self.model.eyes.floor is not None:
+            hidden = _at_border(own) or bool(own[:2].any())
+        else:
+            hidden = sight.cut or self._half_hidden(sight, view)
+        if hidden:
             return
         follower.heights.append(follower.model.height_in(sight))
         if len(follower.heights) >= WHOLE:
