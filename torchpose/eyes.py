@@ -50,6 +50,10 @@ from torchpose.vision.windows import window_max
 GLANCES = 5  # frames of the recording that see whether somebody stands in its background
 SURE = 3.0  # log-odds of a depth reading that is nobody's noise
 PURE = 0.75  # share of a depth reading that must be the person's: with less it lies behind the body's surface
+NEARER, FARTHER = 0.1, 0.95  # of a person's points, that are nearer than where the person begins and ends
+FOOT = 0.1  # m: what is nearer to the scene is hardly told from it
+SURE_SD = 3.0  # standard deviations of a depth, by which it is surely another one
+UNSEEN_FEET = 0.25  # m above the floor, from which at the latest legs are seen
 NOBODY = -1e3  # log-odds of a pixel that has been given to somebody
 
 
@@ -204,6 +208,44 @@ class Eyes(nn.Module):
         if self.camera.baseline is None:
             return 0.0
         return self.config.disparity_sd / (self.camera.focal_length * self.camera.baseline)
+
+    def standing_room(
+        self, sight: Sight, covered: Bool[Tensor, "1 height width"] | None = None
+    ) -> Bool[Tensor, "1 height width"]:
+        """Where somebody (batch 1) may be: the silhouette, and what is `covered` by something nearer.
+
+        Of whoever stands before a depth camera also where the floor is as near as he or she, for there feet cannot be
+        told from it; and nothing below the floor.
+        """
+        allowed = sight.silhouette if covered is None else sight.silhouette | covered
+        floor = self.floor_below(sight)
+        if not isinstance(self.background, DepthBackground) or math.isnan(floor):
+            return allowed
+        z = sight.cloud.points[0, :, 2][sight.cloud.mask[0]]
+        near, far = (float(z.quantile(share)) for share in (NEARER, FARTHER))
+        untold = self.background.depth < far + FOOT + SURE_SD * self.depth_noise * far**2
+        last = math.ceil(self.camera.cy + self.camera.focal_length * floor / near)
+        above = torch.arange(self.camera.height, device=untold.device)[:, None] <= last
+        return sight.silhouette | ((allowed | untold) & above)
+
+    def floor_below(self, sight: Sight) -> float:
+        """y of the empty scene, m, where somebody (batch 1) must stand, if that is just below what is seen; else NaN.
+
+        The feet's readings are too near the floor's to be the person's for sure, so whoever stands looks too short.
+        NaN for stereo, where colour tells them apart.
+        """
+        v, u = sight.silhouette[0].nonzero(as_tuple=True)
+        points = sight.cloud.points[0][sight.cloud.mask[0]]
+        if not isinstance(self.background, DepthBackground) or len(v) == 0 or len(points) == 0:
+            return math.nan
+        lowest, shins = (float(points[:, 1].quantile(share)) for share in (0.99, 0.9))
+        z = points[points[:, 1] >= shins, 2].median()
+        rows, columns = slice(int(v.min() + v.max()) // 2, None), slice(int(u.min()), int(u.max()) + 1)
+        scene = self.background.depth[rows, columns]
+        v, u = ((scene - z).abs() < FOOT).nonzero(as_tuple=True)
+        y = (v + rows.start - self.camera.cy) * scene[v, u] / self.camera.focal_length
+        y = y[(y > lowest - FOOT) & (y < lowest + UNSEEN_FEET)]
+        return float(y.median()) if len(y) else math.nan
 
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:
         """Learn the empty scene from its frames, or where there are none from the recording itself."""

@@ -367,7 +367,7 @@ class People:
         """A first size from frames that show all of the person, until frames with poses tell it better."""
         if follower.sized or sight.cut or self.model.config.height or self._half_hidden(sight, view):
             return
-        follower.extents.append(upright_extent(sight))
+        follower.extents.append(upright_extent(sight, self.model.eyes.floor_below(sight)))
         if len(follower.extents) >= WHOLE:
             height = follower.model.height_of(follower.extents)
             follower.model.size = self.model.body.size_of_height(height)

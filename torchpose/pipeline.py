@@ -144,7 +144,7 @@ class StereoToPose(nn.Module):
             bounds = geodesic_bounds(self.body, self.size)
             geodesic = geodesic_term(cells, bounds, outlier=self.config.registration.outlier > 0)
         # A limb may lie outside of the silhouette where something stands before it.
-        allowed = sight.silhouette if covered is None else sight.silhouette | covered
+        allowed = self.eyes.standing_room(sight, covered)
         z, noise = sight.cloud.points[..., 2][sight.cloud.mask], self.eyes.depth_noise
         if not len(z) or noise * float(z.median()) ** 2 < self.config.registration.ray_sd:
             noise = 0.0
@@ -183,7 +183,8 @@ class StereoToPose(nn.Module):
         """
         size = known
         if size is None:
-            extents = [upright_extent(sight) for sight in sights if sight.present and not sight.cut]
+            whole = [sight for sight in sights if sight.present and not sight.cut]
+            extents = [upright_extent(sight, self.eyes.floor_below(sight)) for sight in whole]
             size = self.body.size_of_height(self.config.height or self.height_of(extents))
         if self.config.size.rounds == 0 and self.config.colour.strength == 0:
             return size
@@ -385,12 +386,18 @@ class SmoothingWindow:
         return [replace(frame, observation=None) for frame in smooth[:count]]
 
 
-def upright_extent(sight: Sight) -> float:
-    """From the head's top down to the lowest point, m; NaN where no point lies below the head."""
+def upright_extent(sight: Sight, floor: float = math.nan) -> float:
+    """From the head's top down to the lowest point, m; NaN where no point lies below the head.
+
+    `floor` is the y of the floor where that is known to be below the feet, m: then they reach down to it.
+    """
     points = sight.cloud.points[0][sight.cloud.mask[0]]
     middle = points.median(0).values
     center = sight.faces.position[0, 0] if bool(sight.faces.found[0]) else middle[0]
     column = points[(points[:, 0] - center).abs() < 0.12, 1]  # raised hands are beside the head
     if not len(column):
         return math.nan
-    return float(torch.quantile(points[:, 1], 0.99) - torch.quantile(column, 0.01))
+    lowest = float(torch.quantile(points[:, 1], 0.99))
+    if not math.isnan(floor):
+        lowest = max(lowest, floor - RIM / 2)
+    return lowest - float(torch.quantile(column, 0.01))

@@ -6,7 +6,7 @@ where the person's location is believed to be (T. 4.3.1).
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
 from torchpose.registration.size import stack_observations
-from torchpose.registration.start import Starter
+from torchpose.registration.start import Starter, pelvis_position
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.tracking.kalman import Gaussian
 from torchpose.vision.faces import Faces
@@ -47,6 +47,8 @@ class TrackingConfig:
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
     against: float = 1.75  # rad off the way somebody walks, from which the other way round is tried, too
+    aside: float = 0.35  # rad off that way, from which a start faces it
+    profile: float = 0.8  # sine of that way against the camera's, from which it is seen in profile
     search_slack: float = (
         3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
     )
@@ -98,6 +100,13 @@ class Tracker(nn.Module):
         self.config = config
         self.registrar = registrar
         self.starter = starter
+        # Of each limb the one of the other side, and the same of legs alone.
+        names = list(body.body_names[1:])
+        self.other_side = [names.index(_other_side(name)) for name in names]
+        self.other_leg = [
+            other if names[own].startswith(("thigh", "shank")) else own
+            for own, other in enumerate(self.other_side)
+        ]
         self.forget()
 
     def forget(self) -> None:
@@ -191,7 +200,7 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.absent, None)
         expected = self.expect(person.time_s, person.root)
         if expected is not None:
-            return expected
+            return self._another_start(person, expected)
         if 0 <= person.time_s - self._failed < self.config.retry:
             return TrackedFrame(TrackStatus.entering, None)
         found = self.starter(person.observation, person.faces, person.size, person.walking)
@@ -200,6 +209,37 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.entering, None)
         self._remember(found, person.time_s)
         return TrackedFrame(TrackStatus.partial if person.cut else TrackStatus.tracked, found)
+
+    def _another_start(self, person: "Sought", expected: Expected) -> Expected:
+        """With a second start that is more of a change than the last pose, where there is one.
+
+        Whoever walks and is not expected to face the way faces it. In profile left and right limbs look alike, and
+        whoever has them exchanged stands too near or too far by as much as they are apart: there it has them the
+        other way round, and so it has crossed legs anywhere.
+        """
+        assert person.observation is not None
+        assert person.faces is not None
+        predicted, walking, joint = expected.starts[:1], person.walking, self.body.joint_names.index
+        off = 0.0 if walking is None else math.remainder(walking - float(predicted[0, 3]), 2 * math.pi)
+        if abs(off) > self.config.aside:
+            turned = predicted.clone()
+            turned[0, 3] += off
+            return replace(expected, starts=torch.cat([predicted, turned]))
+        posed = self.body(predicted, person.size)
+        hips, ankles = (
+            posed.joints[0, joint(f"{name}_left")] - posed.joints[0, joint(f"{name}_right")]
+            for name in ("hip", "ankle")
+        )
+        profile = walking is not None and abs(math.sin(walking)) > self.config.profile
+        if not profile and float(hips @ ankles) >= 0:
+            return expected
+        limbs = self.other_side if profile else self.other_leg
+        directions = self.body.limb_directions(posed)[:, limbs]
+        other = self.body.pose_from_directions(predicted[:, :3], predicted[:, 3:6], directions)
+        if profile:
+            place = pelvis_position(person.observation.cloud, person.faces, person.size, self.body)
+            other = torch.cat([other[:, :2], place[:, 2:], other[:, 3:]], 1)
+        return replace(expected, starts=torch.cat([predicted, other]))
 
     def seeks_limbs(self, person: "Sought", found: Registration) -> bool:
         """Whether limbs are to be sought elsewhere than a registration has them."""
@@ -265,6 +305,11 @@ class Tracker(nn.Module):
         if self._pose is not None and time_s > self._time:
             self._velocity = (found.pose - self._pose) / (time_s - self._time)
         self._pose, self._time = found.pose, time_s
+
+
+def _other_side(name: str) -> str:
+    exchange = {"left": "right", "right": "left"}
+    return "_".join(exchange.get(word, word) for word in name.split("_"))
 
 
 @dataclass(frozen=True)
