@@ -275,6 +275,32 @@ def pelvis_position(
     return torch.stack([x, y, z + 0.11], -1)
 
 
+def other_side(body: BodyModel) -> list[int]:
+    """Of each limb (bodies 1 and on) the number of the one on the other side; its own where there is none."""
+    names, exchange = list(body.body_names[1:]), {"left": "right", "right": "left"}
+    return [names.index("_".join(exchange.get(word, word) for word in name.split("_"))) for name in names]
+
+
+def turned_by(
+    body: BodyModel,
+    pose: Float[Tensor, "batch parameters"],
+    yaw: Float[Tensor, " batch"],
+    size: Float[Tensor, "#batch sizes"],
+) -> Float[Tensor, "batch parameters"]:
+    """Poses turned by `yaw`, rad.
+
+    By up to a right angle the limbs turn with the body. Beyond, somebody was taken for facing the other way: the limbs
+    stay where they are seen, each as the one of the other side.
+    """
+    turned = pose + torch.nn.functional.pad(yaw[:, None], (3, pose.shape[1] - 4))
+    directions = body.limb_directions(body(pose, size))[:, other_side(body)]
+    zero = torch.zeros_like(yaw)
+    back = exp_rotation(torch.stack([zero, yaw, zero], -1)).mT
+    seen = body.pose_from_directions(turned[:, :3], turned[:, 3:6], directions @ back.mT)
+    seen = torch.cat([seen[:, :6], pose[:, 6:8], seen[:, 8:]], 1)
+    return torch.where(yaw.abs()[:, None] > pi / 2, seen, turned)
+
+
 def _directions(
     arm: tuple[tuple[float, ...], tuple[float, ...]], leg: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> Float[Tensor, "limbs 3"]:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchpose.body.model import BodyModel
 from torchpose.least_squares import NormalEquations, Status
 from torchpose.registration.fitting import PoseEquations, PosePrior, equations_by_moments
+from torchpose.registration.start import turned_by
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses, unoccluded
 
@@ -225,7 +226,7 @@ class Smoother(nn.Module):
                 now.bound[:, part],
                 now.status[part],
             )
-            turned = own + torch.nn.functional.pad(off[part, None], (3, own.shape[1] - 4))
+            turned = turned_by(self.body, own, off[part], sizes[part])
             new = self.registrar(seen, turned, sizes[part], None, config.facing_rounds)
             better = judged(new, part) < judged(old, part) - BETTER
             now = now.put(part[better], new.take(better.nonzero()[:, 0]))

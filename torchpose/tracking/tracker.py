@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
 from torchpose.registration.size import stack_observations
-from torchpose.registration.start import Starter, pelvis_position
+from torchpose.registration.start import Starter, other_side, pelvis_position, turned_by
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.tracking.kalman import Gaussian
 from torchpose.vision.faces import Faces
@@ -100,11 +100,9 @@ class Tracker(nn.Module):
         self.config = config
         self.registrar = registrar
         self.starter = starter
-        # Of each limb the one of the other side, and the same of legs alone.
-        names = list(body.body_names[1:])
-        self.other_side = [names.index(_other_side(name)) for name in names]
+        self.other_side = other_side(body)
         self.other_leg = [
-            other if names[own].startswith(("thigh", "shank")) else own
+            other if body.body_names[1 + own].startswith(("thigh", "shank")) else own
             for own, other in enumerate(self.other_side)
         ]
         self.forget()
@@ -118,12 +116,14 @@ class Tracker(nn.Module):
         self._looked = -math.inf  # when limbs were last sought elsewhere, s
         self._failed = -math.inf  # when a search last found nothing, s
         self._turned = -math.inf  # when it was last tried the other way round, s
+        self._changed = -math.inf  # when it last started from a changed pose, s
 
     def state(self) -> dict[str, Tensor]:
         """What the next frame starts from, as tensors; empty where nothing is remembered."""
         poses: dict[str, Tensor] = {}
         memory = {} if self._failed == -math.inf else {"failed": self._failed}
         memory |= {} if self._turned == -math.inf else {"turned": self._turned}
+        memory |= {} if self._changed == -math.inf else {"changed": self._changed}
         if self._pose is not None:
             poses["pose"] = self._pose
             memory |= {"time": self._time, "known_stray": self._known_stray, "looked": self._looked}
@@ -138,6 +138,8 @@ class Tracker(nn.Module):
             self._failed = float(state["failed"])
         if "turned" in state:
             self._turned = float(state["turned"])
+        if "changed" in state:
+            self._changed = float(state["changed"])
         if "pose" in state:
             self._pose, self._time = state["pose"].to(self.body.axes), float(state["time"])
             self._velocity = state["velocity"].to(self.body.axes) if "velocity" in state else None
@@ -220,10 +222,12 @@ class Tracker(nn.Module):
         assert person.observation is not None
         assert person.faces is not None
         predicted, walking, joint = expected.starts[:1], person.walking, self.body.joint_names.index
+        if 0 <= person.time_s - self._changed < self.config.retry:
+            walking = None  # a change that was not taken is not tried again at once
         off = 0.0 if walking is None else math.remainder(walking - float(predicted[0, 3]), 2 * math.pi)
         if abs(off) > self.config.aside:
-            turned = predicted.clone()
-            turned[0, 3] += off
+            self._changed = person.time_s
+            turned = turned_by(self.body, predicted, predicted.new_tensor([off]), person.size)
             return replace(expected, starts=torch.cat([predicted, turned]))
         posed = self.body(predicted, person.size)
         hips, ankles = (
@@ -237,6 +241,7 @@ class Tracker(nn.Module):
         directions = self.body.limb_directions(posed)[:, limbs]
         other = self.body.pose_from_directions(predicted[:, :3], predicted[:, 3:6], directions)
         if profile:
+            self._changed = person.time_s
             place = pelvis_position(person.observation.cloud, person.faces, person.size, self.body)
             other = torch.cat([other[:, :2], place[:, 2:], other[:, 3:]], 1)
         return replace(expected, starts=torch.cat([predicted, other]))
@@ -305,11 +310,6 @@ class Tracker(nn.Module):
         if self._pose is not None and time_s > self._time:
             self._velocity = (found.pose - self._pose) / (time_s - self._time)
         self._pose, self._time = found.pose, time_s
-
-
-def _other_side(name: str) -> str:
-    exchange = {"left": "right", "right": "left"}
-    return "_".join(exchange.get(word, word) for word in name.split("_"))
 
 
 @dataclass(frozen=True)
