@@ -3,6 +3,7 @@
 A floor, a wall and a person's outline by rays; no part of it is shared with the code under test.
 """
 
+import math
 import warnings
 from dataclasses import dataclass
 
@@ -139,3 +140,51 @@ def test_a_background_without_anybody_stays_as_it_is(generator):
         _, masks = look(film, [0, 12])
     assert not masks[0].any()
     assert overlap(masks[1], outline(places[12])) > 0.85
+
+
+# Somebody whose feet cannot be told from the floor.
+
+
+def feetless(generator, x=0.0, lost=0.12):
+    """Eyes that know the room, and their sight of somebody of whose legs the last `lost` m are not seen."""
+    down = (V - CAMERA.cy) / CAMERA.focal_length * PERSON
+    seen = outline(x) & (down < 1.05 - lost)
+    depth = torch.where(seen, PERSON, scene())
+    depth = depth + NOISE * depth.square() * torch.randn(depth.shape, generator=generator)
+    eyes = Eyes(CAMERA, EyesConfig())
+    empty = torch.stack([frame(None, generator) for _ in range(5)])
+    film = Film([frame(None, generator), depth], empty)
+    eyes.learn_background(film.background(), film, torch.device("cpu"))
+    return eyes, eyes(film[1], torch.device("cpu"))
+
+
+@pytest.mark.parametrize("lost", [0.08, 0.2])
+def test_the_floor_below_unseen_feet_is_that_of_the_room(generator, lost):
+    eyes, sight = feetless(generator, lost=lost)
+    assert sight.present
+    assert abs(eyes.floor_below(sight) - 1.05) < 0.03
+
+
+def test_the_floor_far_below_somebody_says_nothing(generator):
+    """Whose legs are hidden does not stand where the scene goes on."""
+    eyes, sight = feetless(generator, lost=0.5)
+    assert math.isnan(eyes.floor_below(sight))
+    assert torch.equal(eyes.standing_room(sight), sight.silhouette)
+
+
+def test_feet_may_be_where_the_floor_is_as_near_and_nobody_is_below_it(generator):
+    eyes, sight = feetless(generator)
+    room = eyes.standing_room(sight)[0]
+    down = (V - CAMERA.cy) / CAMERA.focal_length * PERSON
+    # 5 cm above the floor the ray goes on for 15 cm to it: less than the readings' noise and a foot.
+    feet = (((U - CAMERA.cx) / CAMERA.focal_length * PERSON).abs() < 0.2) & (down > 1.0) & (down < 1.05)
+    assert bool(room[feet].all())
+    assert not bool(room[down > 1.25].any())  # 20 cm under the floor
+    behind = (down < 0.6) & ~sight.silhouette[0]  # the wall, and the floor farther off
+    assert not bool(room[behind].any())
+    assert bool(room[sight.silhouette[0]].all())
+    covered = torch.zeros_like(sight.silhouette)
+    covered[0, :40, :20] = covered[0, 110:] = True
+    room = eyes.standing_room(sight, covered)[0]
+    assert bool(room[:40, :20].all())
+    assert not bool(room[down > 1.25].any())
