@@ -56,10 +56,12 @@ class SmoothingConfig:
             raise ValueError(
                 f"0 <= ahead < stretch must hold, in frames, got {self.ahead} and {self.stretch}"
             )
-        for name in ("apart", "joint_drift", "root_drift", "rest_time"):
+        for name in ("apart", "joint_drift", "root_drift", "rest_time", "walk", "walking_speed", "aside"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("offset_sd", "slide_sd"):
+        if self.facing_rounds < 1:
+            raise ValueError(f"facing_rounds must be at least 1, got {self.facing_rounds}")
+        for name in ("offset_sd", "slide_sd", "backwards_penalty"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
         if not self.piece >= 1:

@@ -69,10 +69,13 @@ class TrackingConfig:
             "look_around",
             "search_slack",
             "against",
+            "aside",
             "memory",
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.profile <= 1:
+            raise ValueError(f"profile must be a sine between 0 and 1, got {self.profile}")
 
 
 @dataclass(frozen=True)
