@@ -511,5 +511,9 @@ def test_crossed_legs_are_also_sought_uncrossed(body, scripted, view):
     second = registrar.starts[1:]
     arms, legs = along(body, crossed)
     assert_close(along(body, second)[0], arms, atol=1e-4, rtol=0)
-    assert_close(along(body, second)[1], legs[[1, 0]], atol=2e-2, rtol=0)
+    assert_close(along(body, second)[1, :, 1], legs[[1, 0], 1], atol=2e-2, rtol=0)  # shanks
+    before, after = (body(one).joints[0] for one in (crossed, second))
+    knees = [names.index(f"knee_{side}") for side in ("left", "right")]
+    assert_close(after[knees], before[knees[::-1]], atol=2e-2, rtol=0)
+    assert_close(after[ankles], before[ankles[::-1]], atol=3e-2, rtol=0)
     assert_close(second[:, :6], crossed[:, :6])

@@ -301,6 +301,34 @@ def turned_by(
     return torch.where(yaw.abs()[:, None] > pi / 2, seen, turned)
 
 
+def legs_uncrossed(
+    body: BodyModel, pose: Float[Tensor, "1 parameters"], size: Float[Tensor, "1 sizes"]
+) -> Float[Tensor, "1 parameters"] | None:
+    """The pose with knees and ankles of left and right in each other's places, if the ankles are crossed; else None.
+
+    Seen from the front, a leg that is fitted to the points of the other one hardly fits worse.
+    """
+    posed, limb = body(pose, size), body.body_names[1:].index
+    left, right = (
+        posed.joints[0, [body.joint_names.index(f"{name}_{side}") for name in ("hip", "knee", "ankle")]]
+        for side in ("left", "right")
+    )
+    hips = left[0] - right[0]
+    if float(hips @ (left[2] - right[2])) >= 0:
+        return None
+    directions = body.limb_directions(posed)
+    across = hips.norm() * directions.new_tensor([1.0, 0.0, 0.0])  # x of the torso's frame is to its left
+    there = directions.clone()
+    for own, other, knee, hip, shift in (
+        ("left", "right", right[1], right[0], -across),
+        ("right", "left", left[1], left[0], across),
+    ):
+        thigh = directions[:, limb(f"thigh_{other}")] * (knee - hip).norm() + shift
+        there[:, limb(f"thigh_{own}")] = torch.nn.functional.normalize(thigh, dim=-1)
+        there[:, limb(f"shank_{own}")] = directions[:, limb(f"shank_{other}")]
+    return body.pose_from_directions(pose[:, :3], pose[:, 3:6], there)
+
+
 def _directions(
     arm: tuple[tuple[float, ...], tuple[float, ...]], leg: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> Float[Tensor, "limbs 3"]:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
 from torchpose.registration.size import stack_observations
-from torchpose.registration.start import Starter, other_side, pelvis_position, turned_by
+from torchpose.registration.start import Starter, legs_uncrossed, other_side, pelvis_position, turned_by
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.tracking.kalman import Gaussian
 from torchpose.vision.faces import Faces
@@ -103,11 +103,6 @@ class Tracker(nn.Module):
         self.config = config
         self.registrar = registrar
         self.starter = starter
-        self.other_side = other_side(body)
-        self.other_leg = [
-            other if body.body_names[1 + own].startswith(("thigh", "shank")) else own
-            for own, other in enumerate(self.other_side)
-        ]
         self.forget()
 
     def forget(self) -> None:
@@ -220,11 +215,11 @@ class Tracker(nn.Module):
 
         Whoever walks and is not expected to face the way faces it. In profile left and right limbs look alike, and
         whoever has them exchanged stands too near or too far by as much as they are apart: there it has them the
-        other way round, and so it has crossed legs anywhere.
+        other way round. Legs that are crossed it has uncrossed.
         """
         assert person.observation is not None
         assert person.faces is not None
-        predicted, walking, joint = expected.starts[:1], person.walking, self.body.joint_names.index
+        predicted, walking = expected.starts[:1], person.walking
         if 0 <= person.time_s - self._changed < self.config.retry:
             walking = None  # a change that was not taken is not tried again at once
         off = 0.0 if walking is None else math.remainder(walking - float(predicted[0, 3]), 2 * math.pi)
@@ -232,22 +227,16 @@ class Tracker(nn.Module):
             self._changed = person.time_s
             turned = turned_by(self.body, predicted, predicted.new_tensor([off]), person.size)
             return replace(expected, starts=torch.cat([predicted, turned]))
-        posed = self.body(predicted, person.size)
-        hips, ankles = (
-            posed.joints[0, joint(f"{name}_left")] - posed.joints[0, joint(f"{name}_right")]
-            for name in ("hip", "ankle")
-        )
-        profile = walking is not None and abs(math.sin(walking)) > self.config.profile
-        if not profile and float(hips @ ankles) >= 0:
-            return expected
-        limbs = self.other_side if profile else self.other_leg
-        directions = self.body.limb_directions(posed)[:, limbs]
-        other = self.body.pose_from_directions(predicted[:, :3], predicted[:, 3:6], directions)
-        if profile:
+        if walking is not None and abs(math.sin(walking)) > self.config.profile:
             self._changed = person.time_s
+            directions = self.body.limb_directions(self.body(predicted, person.size))
             place = pelvis_position(person.observation.cloud, person.faces, person.size, self.body)
-            other = torch.cat([other[:, :2], place[:, 2:], other[:, 3:]], 1)
-        return replace(expected, starts=torch.cat([predicted, other]))
+            root = torch.cat([predicted[:, :2], place[:, 2:], predicted[:, 3:6]], 1)
+            sides = directions[:, other_side(self.body)]
+            other = self.body.pose_from_directions(root[:, :3], root[:, 3:], sides)
+            return replace(expected, starts=torch.cat([predicted, other]))
+        uncrossed = legs_uncrossed(self.body, predicted, person.size)
+        return expected if uncrossed is None else replace(expected, starts=torch.cat([predicted, uncrossed]))
 
     def seeks_limbs(self, person: "Sought", found: Registration) -> bool:
         """Whether limbs are to be sought elsewhere than a registration has them."""
