@@ -164,7 +164,8 @@ class Smoother(nn.Module):
                 f"time_s must give one time for each of the {len(tracked.pose)} frames, rising, got {time_s.tolist()}"
             )
         # Before anything compares poses of neighbours: a turn of 2 pi between them is none.
-        pose = _without_gaps(tracked.pose, is_finite(tracked))
+        sound = is_finite(tracked)
+        pose = _without_gaps(tracked.pose, sound)
         if self.config.backwards_penalty > 0:
             tracked = self._face_the_way(observation, replace(tracked, pose=pose), time_s, size)
             pose = tracked.pose
@@ -185,7 +186,7 @@ class Smoother(nn.Module):
             equations = self._equations(observation, pose, size, time_s, tangential=0.0)
             covariance = self._covariance(equations, pose, size, chain)
         nothing = PosePrior(pose, torch.zeros_like(pose))
-        status = torch.where(is_finite(tracked), best.status, int(Status.NON_FINITE))
+        status = torch.where(sound, best.status, int(Status.NON_FINITE))
         result = self.registrar.evaluate(observation, pose, size, nothing, best.bound, status)
         return Smoothed(replace(result, covariance=covariance + between), time_s, filtered)
 
