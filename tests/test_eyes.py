@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from torchpose.eyes import Eyes, EyesConfig
 from torchpose.recording import Backgrounds, Frame
@@ -139,3 +140,55 @@ def test_a_background_without_anybody_stays_as_it_is(generator):
         _, masks = look(film, [0, 12])
     assert not masks[0].any()
     assert overlap(masks[1], outline(places[12])) > 0.85
+
+
+# Somebody whose feet cannot be told from the floor.
+
+
+def feetless(generator, x=0.0, lost=0.12):
+    """Eyes that know the room, and their sight of somebody of whose legs the last `lost` m are not seen."""
+    down = (V - CAMERA.cy) / CAMERA.focal_length * PERSON
+    seen = outline(x) & (down < 1.05 - lost)
+    depth = torch.where(seen, PERSON, scene())
+    depth = depth + NOISE * depth.square() * torch.randn(depth.shape, generator=generator)
+    eyes = Eyes(CAMERA, EyesConfig())
+    empty = torch.stack([frame(None, generator) for _ in range(5)])
+    film = Film([frame(None, generator), depth], empty)
+    eyes.learn_background(film.background(), film, torch.device("cpu"))
+    return eyes, eyes(film[1], torch.device("cpu"))
+
+
+def test_the_room_has_a_floor(generator):
+    eyes, _ = feetless(generator)
+    at = torch.tensor([[-1.0, 1.05, 2.5], [0.0, 1.05, PERSON], [0.5, 0.05, 3.0]])
+    assert_close(eyes.floor.above(at), torch.tensor([0.0, 0.0, 1.0]), atol=0.03, rtol=0)
+
+
+def test_whose_legs_are_hidden_does_not_stand_where_the_scene_goes_on(generator):
+    eyes, sight = feetless(generator, lost=0.5)
+    assert sight.present
+    assert torch.equal(eyes.standing_room(sight), sight.silhouette)
+
+
+def test_where_no_floor_is_seen_feet_are_where_they_are_seen(generator):
+    eyes, sight = feetless(generator)
+    eyes.floor = None
+    assert torch.equal(eyes.standing_room(sight), sight.silhouette)
+
+
+def test_feet_may_be_where_the_floor_is_as_near_and_nobody_is_below_it(generator):
+    eyes, sight = feetless(generator)
+    room = eyes.standing_room(sight)[0]
+    down = (V - CAMERA.cy) / CAMERA.focal_length * PERSON
+    # 5 cm above the floor the ray goes on for 15 cm to it: less than the readings' noise and a foot.
+    feet = (((U - CAMERA.cx) / CAMERA.focal_length * PERSON).abs() < 0.2) & (down > 1.0) & (down < 1.05)
+    assert bool(room[feet].all())
+    assert not bool(room[down > 1.25].any())  # 20 cm under the floor
+    behind = (down < 0.6) & ~sight.silhouette[0]  # the wall, and the floor farther off
+    assert not bool(room[behind].any())
+    assert bool(room[sight.silhouette[0]].all())
+    covered = torch.zeros_like(sight.silhouette)
+    covered[0, :40, :20] = covered[0, 110:] = True
+    room = eyes.standing_room(sight, covered)[0]
+    assert bool(room[:40, :20].all())
+    assert not bool(room[down > 1.25].any())

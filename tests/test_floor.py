@@ -127,6 +127,15 @@ def test_heights_are_along_the_normal():
     assert_close(floor.above(points), torch.tensor([[2.0, 0.0], [1.4, 2.6]]))
 
 
+@pytest.mark.parametrize("depth", [0.8, 2.5, 6.0])
+def test_pixels_above_it_are_those_whose_points_are(depth):
+    floor = Floor(tilted(12, 4), torch.tensor(1.2, dtype=torch.float64))
+    over = floor.above(depth * rays())
+    above = floor.pixels_above(CAMERA, depth)
+    assert torch.equal(above[over.abs() > 1e-9], over[over.abs() > 1e-9] > 0)
+    assert above.shape == (CAMERA.height, CAMERA.width)
+
+
 def test_a_depth_of_another_size_is_told():
     with pytest.raises(ValueError, match=r"camera's size \(120, 160\), got \(60, 160\)"):
         find_floor(torch.ones(60, 160), CAMERA)

@@ -16,7 +16,9 @@ from torchpose.registration.occlusion import OcclusionConfig, occlusion_potentia
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.vem import Distance, Registrar, RegistrationConfig
 
-ALONE = RegistrationConfig(labelling=LabellingConfig(sweeps=0, potts=0.0))
+ALONE = RegistrationConfig(
+    labelling=LabellingConfig(sweeps=0, potts=0.0), occlusion=OcclusionConfig(penalty=0.0)
+)
 F, R = 3, 60
 
 
@@ -116,7 +118,12 @@ def test_the_half_has_the_points_beside_the_limb(scene):
 
 @pytest.mark.parametrize(
     "setting",
-    [{"hard": False}, {"distance": Distance.algebraic}, {"labelling": LabellingConfig(sweeps=1, potts=0.0)}],
+    [
+        {"hard": False},
+        {"distance": Distance.algebraic},
+        {"labelling": LabellingConfig(sweeps=1, potts=0.0)},
+        {"occlusion": OcclusionConfig()},
+    ],
 )
 def test_other_labels_are_left_to_the_registrar(setting):
     assert not LimbScore.serves(Registrar(BodyModel(), replace(ALONE, **setting)))

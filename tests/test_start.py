@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
-from torchpose.registration.start import StartConfig, Starter, pelvis_position
+from torchpose.registration.start import StartConfig, Starter, other_side, pelvis_position, turned_by
 from torchpose.registration.vem import Registrar, RegistrationConfig
 from torchpose.vision.faces import Faces
 
@@ -245,3 +245,59 @@ def test_going_backwards_must_fit_better(body, starter):
     costs = starter.score(found, walking=0.5) - starter.score(found)
     penalty = starter.config.backwards_penalty
     assert_close(costs, torch.tensor([0.0, penalty / 2, penalty]), atol=1e-4, rtol=0)
+
+
+def offsets(body, pose):
+    """From joint to joint along each limb, m, by name."""
+    joints = dict(zip(body.joint_names, body(pose).joints[0], strict=True))
+    chain = {
+        "upper_arm": ("shoulder", "elbow"),
+        "forearm": ("elbow", "wrist"),
+        "thigh": ("hip", "knee"),
+        "shank": ("knee", "ankle"),
+    }
+    return {
+        f"{limb}_{side}": joints[f"{last}_{side}"] - joints[f"{first}_{side}"]
+        for limb, (first, last) in chain.items()
+        for side in ("left", "right")
+    }
+
+
+def test_the_other_side_of_each_limb_is_its_namesake(body):
+    names = body.body_names[1:]
+    found = {name: names[k] for name, k in zip(names, other_side(body), strict=True)}
+    assert found == {
+        "head": "head",
+        **{f"{limb}_left": f"{limb}_right" for limb in ("upper_arm", "forearm", "thigh", "shank")},
+        **{f"{limb}_right": f"{limb}_left" for limb in ("upper_arm", "forearm", "thigh", "shank")},
+    }
+
+
+@pytest.mark.parametrize("yaw", [0.5, -1.2])
+def test_who_turns_a_little_takes_the_limbs_along(body, yaw):
+    """Every joint goes round the vertical through the hips: x' = x cos + z sin, z' = z cos - x sin."""
+    pose = standing(body, limbs(body, **WAVE), yaw=0.3, x=0.4)
+    found = turned_by(body, pose, torch.tensor([yaw]), body.default_size(1))
+    before, after = (body(one).joints[0] - one[0, :3] for one in (pose, found))
+    x, y, z = before.unbind(1)
+    c, s = math.cos(yaw), math.sin(yaw)
+    assert_close(after, torch.stack([c * x + s * z, y, c * z - s * x], 1), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("yaw", [math.pi, -2.6])
+def test_who_faces_the_other_way_has_the_limbs_where_they_were_as_those_of_the_other_side(body, yaw):
+    pose = standing(body, limbs(body, **T_POSE), yaw=0.2)
+    found = turned_by(body, pose, torch.tensor([yaw]), body.default_size(1))
+    assert_close(found[0, 3], pose[0, 3] + yaw)
+    before, after = offsets(body, pose), offsets(body, found)
+    for name in ("upper_arm", "forearm"):  # the knee of a relaxed leg does not bend the other way
+        assert_close(after[f"{name}_left"], before[f"{name}_right"], atol=2e-3, rtol=0)
+        assert_close(after[f"{name}_right"], before[f"{name}_left"], atol=2e-3, rtol=0)
+
+
+def test_several_are_turned_as_each_alone(body):
+    poses = torch.cat([standing(body, limbs(body, **WAVE)), standing(body, limbs(body, **UP), yaw=1.0)])
+    yaw, size = torch.tensor([0.4, 3.0]), body.default_size(1)
+    both = turned_by(body, poses, yaw, size)
+    for k in (0, 1):
+        assert_close(both[k : k + 1], turned_by(body, poses[k : k + 1], yaw[k : k + 1], size))

@@ -1,6 +1,7 @@
 """The life of a track: by scripted registrations its statuses and memory, by synthetic views the whole of it."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -429,6 +430,8 @@ def test_limbs_that_are_sought_soon_anyway_are_sought_with_somebody_elses(body, 
         ({"look_around": 0.0}, "look_around must be positive, got 0.0"),
         ({"search_slack": -1.0}, "search_slack must be positive, got -1.0"),
         ({"accept_misfit": -1.0}, "accept_misfit must be positive, got -1.0"),
+        ({"aside": 0.0}, "aside must be positive, got 0.0"),
+        ({"profile": 1.5}, "profile must be a sine between 0 and 1, got 1.5"),
     ],
 )
 def test_bad_settings_are_told(setting, message):
@@ -459,3 +462,80 @@ def test_whoever_walks_backwards_is_doubted_and_turned_if_that_fits(body, script
     starter.misfit = GOOD
     tracker(0.05, observation, faces, size, walking=2.8)
     assert starter.calls.count("cold") == 2
+
+
+def along(body, pose):
+    """From joint to joint along each limb of a pose, m: (arms and legs, left and right, upper and lower, 3)."""
+    joints = dict(zip(body.joint_names, body(pose).joints[0], strict=True))
+    chains = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
+    rows = [
+        [
+            torch.stack([joints[f"{b}_{side}"] - joints[f"{a}_{side}"] for a, b in pairwise(c)])
+            for side in ("left", "right")
+        ]
+        for c in chains
+    ]
+    return torch.stack([torch.stack(row) for row in rows])
+
+
+def test_whoever_walks_otherwise_than_expected_is_also_sought_facing_the_way(body, scripted, view):
+    """Every `retry` seconds instead of the last pose; by a right angle at the most only the yaw changes."""
+    tracker, registrar, _ = scripted
+    observation, faces, size = view.observation(), view.no_face(), body.default_size(1)
+    pose = standing(body, yaw=0.2)
+    tracker.begin(pose, 0.0)
+    tracker(0.1, observation, faces, size, walking=1.3)
+    turned = pose.clone()
+    turned[0, 3] = 1.3
+    assert_close(registrar.starts, torch.cat([pose, turned]))
+    registrar.starts = None
+    restored = Tracker(body, CONFIG, registrar, tracker.starter)
+    restored.restore(tracker.state())
+    for one in (tracker, restored):
+        one(0.2, observation, faces, size, walking=1.3)
+        assert_close(registrar.starts[1:], pose)
+    tracker(0.4, observation, faces, size, walking=1.3)
+    assert_close(registrar.starts[1, 3], turned[0, 3])
+    tracker.forget()
+    tracker.begin(pose, 0.0)
+    tracker(0.1, observation, faces, size, walking=0.3)  # as good as the way
+    assert_close(registrar.starts[1:], pose)
+
+
+def test_in_profile_both_sides_are_also_sought_exchanged_where_the_points_are(body, scripted, view):
+    """The limbs of one side point as the other's did, and the hips are as far off as the cloud, not as expected."""
+    tracker, registrar, _ = scripted
+    directions = RELAXED.clone()
+    directions[5] = torch.tensor([0.1, 1.0, -0.3])
+    pose = standing(body, directions, yaw=1.5, z=2.7)
+    profile = see(body, standing(body, directions, yaw=1.5, z=3.0), num=200)
+    tracker.begin(pose, 0.0)
+    tracker(0.1, profile.observation(), profile.no_face(), body.default_size(1), walking=1.5)
+    first, second = registrar.starts.split(1)
+    assert_close(first, pose)
+    assert_close(along(body, second)[:, [1, 0]], along(body, pose), atol=2e-2, rtol=0)
+    assert_close(second[:, [0, 1, 3, 4, 5]], pose[:, [0, 1, 3, 4, 5]])
+    assert abs(float(second[0, 2]) - 3.0) < 0.12
+
+
+def test_crossed_legs_are_also_sought_uncrossed(body, scripted, view):
+    tracker, registrar, _ = scripted
+    directions = RELAXED.clone()
+    directions[5:7] = torch.tensor([[-0.25, 1.0, -0.1], [-0.1, 1.0, 0.0]])  # the left leg over to the right
+    directions[7:9] = torch.tensor([[0.25, 1.0, -0.1], [0.1, 1.0, 0.0]])
+    crossed = standing(body, directions)
+    names = body.joint_names
+    ankles = [names.index(f"ankle_{side}") for side in ("left", "right")]
+    left, right = body(crossed).joints[0, ankles, 0]
+    assert left < right  # the left is at the image's right where they are not crossed
+    tracker.begin(crossed, 0.0)
+    tracker(0.1, view.observation(), view.no_face(), body.default_size(1))
+    second = registrar.starts[1:]
+    arms, legs = along(body, crossed)
+    assert_close(along(body, second)[0], arms, atol=1e-4, rtol=0)
+    assert_close(along(body, second)[1, :, 1], legs[[1, 0], 1], atol=2e-2, rtol=0)  # shanks
+    before, after = (body(one).joints[0] for one in (crossed, second))
+    knees = [names.index(f"knee_{side}") for side in ("left", "right")]
+    assert_close(after[knees], before[knees[::-1]], atol=2e-2, rtol=0)
+    assert_close(after[ankles], before[ankles[::-1]], atol=3e-2, rtol=0)
+    assert_close(second[:, :6], crossed[:, :6])

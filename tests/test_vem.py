@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from synthetic_cloud import CAMERA, mirrored, padded, see, standing, together
+from synthetic_cloud import CAMERA, RELAXED, mirrored, padded, see, standing, together
 from torch.testing import assert_close
 
 from torchpose.body.ellipsoid import NEWTON_STEPS, foot_of_part, foot_point, outline, rough_distance
@@ -15,6 +15,7 @@ from torchpose.registration import vem
 from torchpose.registration.fitting import FittingConfig, JacobianKind, PosePrior
 from torchpose.registration.geodesic import geodesic_bounds, geodesic_term
 from torchpose.registration.labelling import LabellingConfig
+from torchpose.registration.occlusion import OcclusionConfig
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.size import stack_observations
 from torchpose.registration.vem import (
@@ -597,3 +598,37 @@ def test_a_noisy_batch_equals_one_by_one():
         alone = registrar(observation, pose, size)
         assert_close(both.pose[k : k + 1], alone.pose, atol=1e-4, rtol=0)
         assert_close(both.misfit[k : k + 1], alone.misfit, atol=1e-4, rtol=0)
+
+
+def test_noisy_points_tell_near_limbs_from_far_ones_by_what_hides_what():
+    """In profile, limbs exchanged and the body nearer by their gap: what would be hidden cannot have been seen.
+
+    The points are cast at the true pose's ellipsoids; the margin is in nats of a frame.
+    """
+    body, directions = BodyModel(), RELAXED.clone()
+    directions[5:7] = torch.tensor([[0.1, 1.0, -0.4], [0.1, 1.0, -0.2]])
+    directions[7:9] = torch.tensor([[-0.1, 1.0, 0.2], [-0.1, 1.0, 0.5]])
+    exchanged = directions[[0, 3, 4, 1, 2, 7, 8, 5, 6]]
+    generator = torch.Generator().manual_seed(0)
+    poses = torch.cat([standing(body, directions, yaw=1.57), standing(body, exchanged, yaw=1.57, z=2.8)])
+    view = see(body, poses[:1], noise=0.06, generator=generator)
+    noisy = replace(view.observation(), depth_noise=0.06 / 9)
+
+    def margin(penalty, observation):
+        config = RegistrationConfig(occlusion=OcclusionConfig(penalty=penalty))
+        found = Registrar(body, config).evaluate(
+            observation,
+            poses,
+            body.default_size(1),
+            PosePrior(poses, torch.zeros_like(poses)),
+            torch.zeros(1, 2),
+            torch.zeros(2, dtype=torch.long),
+            covariance=False,
+        )
+        return float(found.score[1] - found.score[0])
+
+    assert margin(5.0, noisy) > margin(0.0, noisy) + 20
+    assert margin(5.0, noisy) > 20
+    # Points that are exact tell it by their depth, and nothing is added.
+    exact = replace(noisy, depth_noise=0.0)
+    assert margin(5.0, exact) == margin(0.0, exact)

@@ -146,7 +146,7 @@ class StereoToPose(nn.Module):
             bounds = geodesic_bounds(self.body, self.size)
             geodesic = geodesic_term(cells, bounds, outlier=self.config.registration.outlier > 0)
         # A limb may lie outside of the silhouette where something stands before it.
-        allowed = sight.silhouette if covered is None else sight.silhouette | covered
+        allowed = self.eyes.standing_room(sight, covered)
         z, noise = sight.cloud.points[..., 2][sight.cloud.mask], self.eyes.depth_noise
         if not len(z) or noise * float(z.median()) ** 2 < self.config.registration.ray_sd:
             noise = 0.0

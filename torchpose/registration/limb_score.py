@@ -57,7 +57,7 @@ class LimbScore(nn.Module):
     def serves(registrar: Registrar) -> bool:
         """Whether the registrar judges points as it is done here."""
         config = registrar.config
-        alone = config.labelling.sweeps == 0 and config.labelling.potts == 0
+        alone = config.labelling.sweeps == 0 and config.labelling.potts == 0 and config.occlusion.penalty == 0
         return alone and config.hard and config.distance is Distance.euclidean
 
     def know(

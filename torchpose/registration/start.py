@@ -296,6 +296,60 @@ def pelvis_position(
     return torch.stack([x, y, z + 0.11], -1)
 
 
+def other_side(body: BodyModel) -> list[int]:
+    """Of each limb (bodies 1 and on) the number of the one on the other side; its own where there is none."""
+    names, exchange = list(body.body_names[1:]), {"left": "right", "right": "left"}
+    return [names.index("_".join(exchange.get(word, word) for word in name.split("_"))) for name in names]
+
+
+def turned_by(
+    body: BodyModel,
+    pose: Float[Tensor, "batch parameters"],
+    yaw: Float[Tensor, " batch"],
+    size: Float[Tensor, "#batch sizes"],
+) -> Float[Tensor, "batch parameters"]:
+    """Poses turned by `yaw`, rad.
+
+    By up to a right angle the limbs turn with the body. Beyond, somebody was taken for facing the other way: the limbs
+    stay where they are seen, each as the one of the other side.
+    """
+    turned = pose + torch.nn.functional.pad(yaw[:, None], (3, pose.shape[1] - 4))
+    directions = body.limb_directions(body(pose, size))[:, other_side(body)]
+    zero = torch.zeros_like(yaw)
+    back = exp_rotation(torch.stack([zero, yaw, zero], -1)).mT
+    seen = body.pose_from_directions(turned[:, :3], turned[:, 3:6], directions @ back.mT)
+    seen = torch.cat([seen[:, :6], pose[:, 6:8], seen[:, 8:]], 1)
+    return torch.where(yaw.abs()[:, None] > pi / 2, seen, turned)
+
+
+def legs_uncrossed(
+    body: BodyModel, pose: Float[Tensor, "1 parameters"], size: Float[Tensor, "1 sizes"]
+) -> Float[Tensor, "1 parameters"] | None:
+    """The pose with knees and ankles of left and right in each other's places, if the ankles are crossed; else None.
+
+    Seen from the front, a leg that is fitted to the points of the other one hardly fits worse.
+    """
+    posed, limb = body(pose, size), body.body_names[1:].index
+    left, right = (
+        posed.joints[0, [body.joint_names.index(f"{name}_{side}") for name in ("hip", "knee", "ankle")]]
+        for side in ("left", "right")
+    )
+    hips = left[0] - right[0]
+    if float(hips @ (left[2] - right[2])) >= 0:
+        return None
+    directions = body.limb_directions(posed)
+    across = hips.norm() * directions.new_tensor([1.0, 0.0, 0.0])  # x of the torso's frame is to its left
+    there = directions.clone()
+    for own, other, knee, hip, shift in (
+        ("left", "right", right[1], right[0], -across),
+        ("right", "left", left[1], left[0], across),
+    ):
+        thigh = directions[:, limb(f"thigh_{other}")] * (knee - hip).norm() + shift
+        there[:, limb(f"thigh_{own}")] = torch.nn.functional.normalize(thigh, dim=-1)
+        there[:, limb(f"shank_{own}")] = directions[:, limb(f"shank_{other}")]
+    return body.pose_from_directions(pose[:, :3], pose[:, 3:6], there)
+
+
 def _directions(
     arm: tuple[tuple[float, ...], tuple[float, ...]], leg: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> Float[Tensor, "limbs 3"]:

@@ -34,6 +34,7 @@ from torchpose.registration.fitting import (
     pose_terms,
 )
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
+from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
 from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_residual, silhouette_rows
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
@@ -74,6 +75,8 @@ class RegistrationConfig:
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
     rim: RimConfig = field(default_factory=RimConfig)
+    # Of what a body hides of itself, where poses of points noisier than `ray_sd` are judged.
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
 
     def __post_init__(self) -> None:
         for name in ("rounds", "near"):
@@ -478,6 +481,11 @@ class Registrar(nn.Module):
         cloud = observation.cloud
         posed = self.body(pose, size) if posed is None else posed
         foot = self.correspond(posed, observation)
+        if observation.depth_noise > 0 and config.occlusion.penalty > 0:
+            # Where distances along the ray hardly count, a body with left and right exchanged fits as well, half of it
+            # behind the other half: what hides what tells the two apart.
+            hidden = occlusion_potential(posed, cloud.points, config.occlusion)
+            observation = replace(observation, potential=observation.potential + hidden)
         labelling = self.label(posed, foot, observation, config.sigma_last)
         doubt = pose.new_tensor(torch.nan).expand(*pose.shape, pose.shape[1])
         if covariance:

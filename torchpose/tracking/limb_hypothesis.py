@@ -101,7 +101,9 @@ class LimbHypotheses(nn.Module):
         super().__init__()
         self.body, self.config = body, config
         alone = LabellingConfig(sweeps=0, potts=0.0)
-        self.registrar = Registrar(body, replace(registrar.config, labelling=alone))
+        # What is hidden is among the observation's own potentials, see `seen`.
+        nothing = OcclusionConfig(penalty=0.0)
+        self.registrar = Registrar(body, replace(registrar.config, labelling=alone, occlusion=nothing))
         self.search = LimbSearch(body, self.registrar, config.limbs)
         effective = registrar.config.effective_points / 2  # see `nearer_half`
         self.fitter = Registrar(body, replace(self.registrar.config, effective_points=effective))

@@ -6,7 +6,7 @@ where the person's location is believed to be (T. 4.3.1).
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior
 from torchpose.registration.size import stack_observations
-from torchpose.registration.start import Starter
+from torchpose.registration.start import Starter, legs_uncrossed, other_side, pelvis_position, turned_by
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.tracking.kalman import Gaussian
 from torchpose.vision.faces import Faces
@@ -47,6 +47,8 @@ class TrackingConfig:
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
     retry: float = 0.25  # s after a search that found nothing better, before the next one
     against: float = 1.75  # rad off the way somebody walks, from which the other way round is tried, too
+    aside: float = 0.35  # rad off that way, from which a start faces it
+    profile: float = 0.8  # sine of that way against the camera's, from which it is seen in profile
     search_slack: float = (
         3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
     )
@@ -67,10 +69,13 @@ class TrackingConfig:
             "look_around",
             "search_slack",
             "against",
+            "aside",
             "memory",
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.profile <= 1:
+            raise ValueError(f"profile must be a sine between 0 and 1, got {self.profile}")
 
 
 @dataclass(frozen=True)
@@ -109,12 +114,14 @@ class Tracker(nn.Module):
         self._looked = -math.inf  # when limbs were last sought elsewhere, s
         self._failed = -math.inf  # when a search last found nothing, s
         self._turned = -math.inf  # when it was last tried the other way round, s
+        self._changed = -math.inf  # when it last started from a changed pose, s
 
     def state(self) -> dict[str, Tensor]:
         """What the next frame starts from, as tensors; empty where nothing is remembered."""
         poses: dict[str, Tensor] = {}
         memory = {} if self._failed == -math.inf else {"failed": self._failed}
         memory |= {} if self._turned == -math.inf else {"turned": self._turned}
+        memory |= {} if self._changed == -math.inf else {"changed": self._changed}
         if self._pose is not None:
             poses["pose"] = self._pose
             memory |= {"time": self._time, "known_stray": self._known_stray, "looked": self._looked}
@@ -129,6 +136,8 @@ class Tracker(nn.Module):
             self._failed = float(state["failed"])
         if "turned" in state:
             self._turned = float(state["turned"])
+        if "changed" in state:
+            self._changed = float(state["changed"])
         if "pose" in state:
             self._pose, self._time = state["pose"].to(self.body.axes), float(state["time"])
             self._velocity = state["velocity"].to(self.body.axes) if "velocity" in state else None
@@ -191,7 +200,7 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.absent, None)
         expected = self.expect(person.time_s, person.root)
         if expected is not None:
-            return expected
+            return self._another_start(person, expected)
         if 0 <= person.time_s - self._failed < self.config.retry:
             return TrackedFrame(TrackStatus.entering, None)
         found = self.starter(person.observation, person.faces, person.size, person.walking)
@@ -200,6 +209,34 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.entering, None)
         self._remember(found, person.time_s)
         return TrackedFrame(TrackStatus.partial if person.cut else TrackStatus.tracked, found)
+
+    def _another_start(self, person: "Sought", expected: Expected) -> Expected:
+        """With a second start that is more of a change than the last pose, where there is one.
+
+        Whoever walks and is not expected to face the way faces it. In profile left and right limbs look alike, and
+        whoever has them exchanged stands too near or too far by as much as they are apart: there it has them the
+        other way round. Legs that are crossed it has uncrossed.
+        """
+        assert person.observation is not None
+        assert person.faces is not None
+        predicted, walking = expected.starts[:1], person.walking
+        if 0 <= person.time_s - self._changed < self.config.retry:
+            walking = None  # a change that was not taken is not tried again at once
+        off = 0.0 if walking is None else math.remainder(walking - float(predicted[0, 3]), 2 * math.pi)
+        if abs(off) > self.config.aside:
+            self._changed = person.time_s
+            turned = turned_by(self.body, predicted, predicted.new_tensor([off]), person.size)
+            return replace(expected, starts=torch.cat([predicted, turned]))
+        if walking is not None and abs(math.sin(walking)) > self.config.profile:
+            self._changed = person.time_s
+            directions = self.body.limb_directions(self.body(predicted, person.size))
+            place = pelvis_position(person.observation.cloud, person.faces, person.size, self.body)
+            root = torch.cat([predicted[:, :2], place[:, 2:], predicted[:, 3:6]], 1)
+            sides = directions[:, other_side(self.body)]
+            other = self.body.pose_from_directions(root[:, :3], root[:, 3:], sides)
+            return replace(expected, starts=torch.cat([predicted, other]))
+        uncrossed = legs_uncrossed(self.body, predicted, person.size)
+        return expected if uncrossed is None else replace(expected, starts=torch.cat([predicted, uncrossed]))
 
     def seeks_limbs(self, person: "Sought", found: Registration) -> bool:
         """Whether limbs must be sought elsewhere than a registration has them."""

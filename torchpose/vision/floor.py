@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.vision.camera import StereoCamera
@@ -54,6 +54,15 @@ class Floor:
     def above(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Heights of points over the floor, m."""
         return points @ self.normal.to(points) + self.height.to(points)
+
+    def pixels_above(self, camera: StereoCamera, depth: float) -> Bool[Tensor, "height width"]:
+        """Pixels whose points at this depth, m, are not below the floor."""
+        v, u = (
+            torch.arange(size).to(self.normal) - middle
+            for size, middle in ((camera.height, camera.cy), (camera.width, camera.cx))
+        )
+        over = (v[:, None] * self.normal[1] + u * self.normal[0]) / camera.focal_length + self.normal[2]
+        return depth * over + self.height >= 0
 
 
 def find_floor(
