@@ -214,8 +214,8 @@ class Tracker(nn.Module):
         """With a second start that is more of a change than the last pose, where there is one.
 
         Whoever walks and is not expected to face the way faces it. In profile left and right limbs look alike where
-        depths are noisy, and whoever has them exchanged stands too near or too far by as much as they are apart: there it has them the
-        other way round. Legs that are crossed it has uncrossed.
+        depths are noisy, and whoever has them exchanged stands too near or too far by as much as they are apart:
+        there it has them the other way round. Legs that are crossed it has uncrossed.
         """
         assert person.observation is not None
         assert person.faces is not None
