@@ -213,9 +213,9 @@ class Tracker(nn.Module):
     def _another_start(self, person: "Sought", expected: Expected) -> Expected:
         """With a second start that is more of a change than the last pose, where there is one.
 
-        Whoever walks and is not expected to face the way faces it. In profile left and right limbs look alike, and
-        whoever has them exchanged stands too near or too far by as much as they are apart: there it has them the
-        other way round. Legs that are crossed it has uncrossed.
+        Whoever walks and is not expected to face the way faces it. In profile left and right limbs look alike where
+        depths are noisy, and whoever has them exchanged stands too near or too far by as much as they are apart:
+        there it has them the other way round. Legs that are crossed it has uncrossed.
         """
         assert person.observation is not None
         assert person.faces is not None
@@ -227,7 +227,8 @@ class Tracker(nn.Module):
             self._changed = person.time_s
             turned = turned_by(self.body, predicted, predicted.new_tensor([off]), person.size)
             return replace(expected, starts=torch.cat([predicted, turned]))
-        if walking is not None and abs(math.sin(walking)) > self.config.profile:
+        noisy = person.observation.depth_noise > 0  # else depth tells near limbs from far ones
+        if noisy and walking is not None and abs(math.sin(walking)) > self.config.profile:
             self._changed = person.time_s
             directions = self.body.limb_directions(self.body(predicted, person.size))
             place = pelvis_position(person.observation.cloud, person.faces, person.size, self.body)
