@@ -54,9 +54,8 @@ class StartConfig:
     apart: float = 0.05  # rad by which limbs differ that are exchanged: the others end in the same place
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
-    refresh_sigma: float = 0.05  # m, in a refresh's first round: all but a limb or two are right
-    refresh_rounds: int = 3  # of a refresh's starts
-    refresh_final_rounds: int = 4  # of the best few of them
+    # m, in a refresh's first rounds on few points and on all: all but a limb or two are right
+    refresh_sigma: float = 0.05
     face_yaws: tuple[float, ...] = (-75.0, -35.0, 0.0, 35.0, 75.0)  # degrees: a face is seen, or none can be
     yaws: tuple[float, ...] = (-90.0, -45.0, 0.0, 45.0, 90.0, 180.0)  # when none is
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
@@ -65,10 +64,7 @@ class StartConfig:
     backwards_penalty: float = 15.0  # nats that a pose turned against the way somebody walks must make good
 
     def __post_init__(self) -> None:
-        for name in (
-            *("points", "rounds", "final_rounds", "finalists", "exchanged"),
-            *("refresh_rounds", "refresh_final_rounds"),
-        ):
+        for name in ("points", "rounds", "final_rounds", "finalists", "exchanged"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.apart < 0:
@@ -80,16 +76,6 @@ class StartConfig:
                 "back_penalty and backwards_penalty must not be negative, "
                 f"got {self.back_penalty} and {self.backwards_penalty}"
             )
-
-
-@dataclass(frozen=True)
-class _Schedule:
-    """How a search fits: its starts on a few points, then the best of them on all."""
-
-    rounds: int
-    sigma: float  # m, in the first round
-    final_rounds: int
-    final_sigma: float | None = None  # m; None: as configured for any registration
 
 
 class Starter(nn.Module):
@@ -118,8 +104,7 @@ class Starter(nn.Module):
         """
         walking = None if bool(faces.found[0]) else walking
         starts = self.hypotheses(observation, faces, size, walking)
-        schedule = _Schedule(self.config.rounds, self.config.sigma, self.config.final_rounds)
-        found = self._search(observation, starts[None], size, schedule, walking=walking)
+        found = self._search(observation, starts[None], size, self.config.sigma, walking=walking)
         for _ in range(self.config.refreshes):
             if float(found.misfit) < self.config.good_misfit:
                 break
@@ -145,15 +130,15 @@ class Starter(nn.Module):
             together[:, own] = limbs[:, k, 0, own]
         starts = torch.cat([pose[:, None], together[:, None], limbs.flatten(1, 2)], 1)
         sigma = self.config.refresh_sigma
-        schedule = _Schedule(self.config.refresh_rounds, sigma, self.config.refresh_final_rounds, sigma)
-        return self._search(observation, starts, size, schedule, prior, walking)
+        return self._search(observation, starts, size, sigma, sigma, prior, walking)
 
     def _search(
         self,
         observation: Observation,
         starts: Float[Tensor, "batch starts parameters"],
         size: Float[Tensor, "#batch sizes"],
-        schedule: _Schedule,
+        sigma: float,
+        final_sigma: float | None = None,
         prior: PosePrior | None = None,
         walking: float | None = None,
     ) -> Registration:
@@ -164,7 +149,7 @@ class Starter(nn.Module):
         row = torch.arange(B, device=starts.device)
         every = row.repeat_interleave(S)
         rough = self._fit(
-            self.coarse, few, every, starts.flatten(0, 1), size, prior, schedule.rounds, schedule.sigma
+            self.coarse, few, every, starts.flatten(0, 1), size, prior, self.config.rounds, sigma
         )
         pose, score = rough.pose.view(B, S, P), self.score(rough, walking).view(B, S)
         arms, new_arms = self._exchange(pose, score, ("upper_arm", "forearm"))
@@ -177,10 +162,9 @@ class Starter(nn.Module):
         best = rank.topk(min(self.config.finalists, S), largest=False).indices
         finalists = combined.masked_scatter(new[..., None], again.pose)
         finalists = finalists.gather(1, best[..., None].expand(-1, -1, P)).flatten(0, 1)
-        every = row.repeat_interleave(best.shape[1])
-        rounds, sigma = schedule.final_rounds, schedule.final_sigma
+        every, rounds = row.repeat_interleave(best.shape[1]), self.config.final_rounds
         final = self._fit(
-            self.registrar, observation, every, finalists, size, prior, rounds, sigma, covariance=True
+            self.registrar, observation, every, finalists, size, prior, rounds, final_sigma, covariance=True
         )
         return final.take(row * best.shape[1] + self.score(final, walking).view_as(best).argmin(1))
 
