@@ -28,8 +28,6 @@ FLOOR = 1e-6  # precision of every unknown of every frame, so that none is witho
 
 @dataclass(frozen=True)
 class SmoothingConfig:
-    sweeps: int = 1  # in which frames also start from their neighbours' poses
-    apart: float = 0.25  # rad by which a neighbour must differ for that
     rounds: int = 3  # of labelling and joint fitting; 0 leaves the frames as they were tracked
     steps: int = 2  # of Gauss and Newton in each
     joint_drift: float = 1.0  # rad that a joint goes astray in a second, growing with the root of time
@@ -50,13 +48,13 @@ class SmoothingConfig:
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
 
     def __post_init__(self) -> None:
-        if self.sweeps < 0 or self.rounds < 0 or self.steps < 1:
-            raise ValueError(f"sweeps and rounds must not be negative and steps at least 1, got {self}")
+        if self.rounds < 0 or self.steps < 1:
+            raise ValueError(f"rounds must not be negative and steps at least 1, got {self}")
         if not 0 <= self.ahead < self.stretch:
             raise ValueError(
                 f"0 <= ahead < stretch must hold, in frames, got {self.ahead} and {self.stretch}"
             )
-        for name in ("apart", "joint_drift", "root_drift", "rest_time", "walk", "walking_speed", "aside"):
+        for name in ("joint_drift", "root_drift", "rest_time", "walk", "walking_speed", "aside"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.facing_rounds < 1:
@@ -172,8 +170,6 @@ class Smoother(nn.Module):
         pose = torch.cat([pose[:, :3], _unwound(pose[:, ANGLES], before), pose[:, 6:]], 1)
         best = replace(tracked, pose=pose)
         chain = self._chain(time_s, pose, before)
-        for _ in range(self.config.sweeps):
-            best = self._try_neighbours(observation, best, chain.pull, size)
         pose, covariance, filtered = best.pose, best.covariance, torch.zeros_like(best.covariance)
         between = torch.zeros_like(covariance)
         if self.config.rounds and self.config.hypotheses.sweeps:
@@ -233,47 +229,6 @@ class Smoother(nn.Module):
             new = self.registrar(seen, turned, sizes[part], None, config.facing_rounds)
             better = judged(new, part) < judged(old, part) - BETTER
             now = now.put(part[better], new.take(better.nonzero()[:, 0]))
-        return now
-
-    def _try_neighbours(
-        self, observation: Observation, now: Registration, pull: Tensor, size: Tensor
-    ) -> Registration:
-        """Each frame that differs from a neighbour is fitted anew, from its own pose and from there; the best is kept.
-
-        All three poses are weighed with the same prior, that of both neighbours: with the prior of one, a frame that is
-        right would follow a neighbour that is wrong.
-        """
-        T = len(now.pose)
-        frames = torch.arange(T, device=now.pose.device)
-        tie = torch.nn.functional.pad(pull, (0, 0, 1, 1))
-        tie_before, tie_after = tie[:-1], tie[1:]
-        precision, sizes = tie_before + tie_after, size.expand(T, -1)
-        for side in (-1, 1):
-            pose = now.pose  # with what the first side has found
-            before, after = pose[(frames - 1).clamp_min(0)], pose[(frames + 1).clamp_max(T - 1)]
-            mean = (tie_before * before + tie_after * after) / precision
-            other = before if side < 0 else after
-            rows = ((other[:, 6:] - pose[:, 6:]).abs().amax(1) > self.config.apart).nonzero()[:, 0]
-            for part in rows.split(MOST) if len(rows) else ():
-                twice = part.repeat(2)
-                old = self.registrar.evaluate(
-                    observation.share(part),
-                    pose[part],
-                    sizes[part],
-                    PosePrior(mean[part], precision[part]),
-                    now.bound[:, part],
-                    now.status[part],
-                )
-                both = self.registrar(
-                    observation.share(twice),
-                    torch.cat([pose[part], other[part]]),
-                    sizes[twice],
-                    PosePrior(mean[twice], precision[twice]),
-                )
-                score, which = both.score.nan_to_num(nan=torch.inf).view(2, -1).min(0)
-                better = score < old.score.nan_to_num(nan=torch.inf) - BETTER
-                chosen = torch.arange(len(part)).to(part) + len(part) * which
-                now = now.put(part[better], both.take(chosen[better]))
         return now
 
     def _equations(
