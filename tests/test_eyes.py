@@ -105,7 +105,7 @@ def test_two_identical_frames_give_the_same(generator):
 def test_the_floor_is_in_the_state(generator):
     """Before anybody was seen, too: the files of a run may be all that is left to do."""
     film, _ = walk(generator)
-    eyes, _ = look(film, [0])
+    eyes, _ = look(film, [])
     assert float(eyes.floor.height) == pytest.approx(1.05, abs=0.02)
     for state in (eyes.state(), look(film, [11])[0].state()):
         other = Eyes(CAMERA, EyesConfig())

@@ -204,6 +204,23 @@ class TestUpright:
         assert_close(finer.pose[1::2, 4], (pose[1:, 4] + pose[:-1, 4]) / 2, atol=1e-9, rtol=0)
         assert_close(body(finer.pose, size).joints[::2], found.joints, atol=1e-9, rtol=0)
 
+    def test_of_two_roots_of_one_turn_the_pose_s_own_is_kept(
+        self, body: BodyModel, size: torch.Tensor
+    ) -> None:
+        """Whoever is turned and bent sideways, too: both triples of angles stand for the same body."""
+        level = upright(body, size)
+        level.pose[:, 4:6] = torch.tensor([1.0, 0.3])
+        near, wanted = seen_by(14, 6, 1.2, body, size, level)
+        yaw, pitch, roll = near.pose[:, 3:6].unbind(1)
+        far = torch.cat(
+            [near.pose[:, :3], torch.stack([yaw, -pitch, roll], 1) + torch.pi, near.pose[:, 6:]], 1
+        )
+        assert_close(body(far, size).joints, near.joints, atol=1e-9, rtol=0)
+        for pose, beyond in ((near.pose, False), (far, True)):
+            found = level_sequence(dataclasses.replace(near, pose=pose), floor_of(14, 6, 1.2)).pose
+            assert ((found[:, 4] > torch.pi / 2) == beyond).all()
+            assert_close(body(found, size).joints, wanted.joints, atol=1e-9, rtol=0)
+
 
 class TestSequence:
     def test_frames_without_a_pose_have_none(self, body: BodyModel, size: torch.Tensor) -> None:
