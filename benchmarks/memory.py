@@ -27,6 +27,7 @@ from torchpose.session import Session
 from torchpose.synthesis.database import make_recording, synthetic_camera
 from torchpose.tracking.tracker import TrackStatus
 from torchpose.vision.camera import StereoCamera
+from torchpose.vision.floor import Floor
 
 STRETCH, POINTS = 50, 500
 SMALL = StereoCamera(64, 48, 60.0, 31.5, 23.5, 0.12, 30.0)
@@ -61,6 +62,7 @@ def export(count: int, folder: Path) -> dict[str, float]:
     black = torch.zeros(3, SMALL.height, SMALL.width)
     recording = Repeated([Frame(0, 0.0, black, black)], SMALL, count, Backgrounds())
     model = StereoToPose(SMALL)
+    model.eyes.floor = Floor(torch.tensor([0.0, -0.96, -0.28]), torch.tensor(1.2))  # its files are levelled
     session = Session(People(model), recording, folder, {}, "1")
     session.begin(fresh=True)
     part = poses(model)

@@ -103,6 +103,22 @@ def test_two_identical_frames_give_the_same(generator):
     assert torch.equal(again.silhouette[0], one)
 
 
+def test_the_floor_is_in_the_state(generator):
+    """Before anybody was seen, too: the files of a run may be all that is left to do."""
+    film, _ = walk(generator)
+    eyes, _ = look(film, [])
+    assert float(eyes.floor.height) == pytest.approx(1.05, abs=0.02)
+    for state in (eyes.state(), look(film, [11])[0].state()):
+        other = Eyes(CAMERA, EyesConfig())
+        other.restore(state, torch.device("cpu"))
+        assert torch.equal(other.floor.normal, eyes.floor.normal)
+        assert torch.equal(other.floor.height, eyes.floor.height)
+    blind = Eyes(CAMERA, EyesConfig())
+    assert blind.state() == {}
+    blind.restore({}, torch.device("cpu"))
+    assert blind.floor is None
+
+
 @pytest.mark.filterwarnings("ignore:nobody moves")
 @pytest.mark.parametrize("arm", [0.0, 0.5], ids=["still", "an arm moves"])
 def test_who_is_there_from_the_first_frame_to_the_last_is_seen(generator, arm):

@@ -78,7 +78,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "learning": ("part_network", "training"),
     "the desk": (
         *("depthai", "calibration", "video", "recording", "scaled", "aligned", "capture", "rendered"),
-        *("export", "trajectory_filter", "resampling", "opensim", "bvh", "c3d_file", "motion_export"),
+        *("export", "trajectory_filter", "level", "resampling"),
+        *("opensim", "bvh", "c3d_file", "motion_export"),
         *("figures", "timeline", "journal", "report", "rerun_log", "activities"),
         *("eyes", "pipeline", "window", "people", "parts", "overlay", "picture", "session"),
         *("feed", "web_view", "live", "clips", "study", "cli"),

@@ -157,6 +157,32 @@ def test_one_frame_is_enough(shown: tuple[Shown, torch.Tensor], tmp_path: Path):
     }
 
 
+def test_files_stand_on_the_floor_also_when_only_they_were_left_to_write(
+    shown: tuple[Shown, torch.Tensor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The room's floor is 1.1 m below a level camera; what learned it was another process."""
+    recording, truth = shown
+    short = Shown(recording.camera, recording.frames[:2], recording.empty)
+
+    def session() -> Session:
+        return Session(tp.People(tp.StereoToPose(short.camera, config=CONFIG)), short, tmp_path, {}, "1")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "finish", lambda *_: {})  # it ends before its files
+        session().run()
+    assert not (tmp_path / "summary.json").exists()
+    monkeypatch.setattr(tp.Eyes, "learn_background", lambda *_: pytest.fail("there is no frame to follow"))
+    floor = session().run()["floor"]
+    assert floor["tilt_deg"] < 1
+    assert floor["height_m"] == pytest.approx(1.1, abs=0.02)
+    markers = np.loadtxt(tmp_path / "poses.trc", skiprows=6)[:, 2:].reshape(2, 15, 3)
+    feet = 1000 * (1.1 - truth[:2, -2:, 1].numpy())  # mm
+    np.testing.assert_allclose(markers[:, -2:, 1], feet, atol=80)
+    assert (feet > 0).all()
+    table = tp.read_poses_csv(tmp_path / "poses.csv")
+    np.testing.assert_allclose(table.joints[:, :, 1], floor["height_m"] - markers[..., 1] / 1000, atol=0.01)
+
+
 def test_whoever_is_only_entering_answers_nothing(
     shown: tuple[Shown, torch.Tensor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

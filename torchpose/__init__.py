@@ -10,6 +10,7 @@ from torchpose.c3d_file import write_c3d
 from torchpose.export import PoseSequence, read_poses_csv, read_poses_npz
 from torchpose.eyes import Eyes, EyesConfig
 from torchpose.least_squares import LMConfig, levenberg_marquardt
+from torchpose.level import level_sequence
 from torchpose.motion_export import ExportConfig
 from torchpose.opensim import write_mot, write_trc
 from torchpose.people import People, PeopleConfig
@@ -26,6 +27,7 @@ from torchpose.vision.background import BackgroundModel, DepthBackground
 from torchpose.vision.camera import RawStereo, StereoCamera
 from torchpose.vision.disparity import Disparity
 from torchpose.vision.faces import FaceDetector, Faces
+from torchpose.vision.floor import Floor
 from torchpose.vision.growing_seeds import GrowingSeeds, GrowingSeedsConfig
 from torchpose.vision.points import PointCloud, group_cells, sample_grid
 from torchpose.vision.semi_global import SemiGlobal, SemiGlobalConfig
@@ -48,6 +50,7 @@ __all__ = [
     "FaceDetector",
     "Faces",
     "FilterKind",
+    "Floor",
     "Frame",
     "GrowingSeeds",
     "GrowingSeedsConfig",
@@ -82,6 +85,7 @@ __all__ = [
     "filter_sequence",
     "foot_point",
     "group_cells",
+    "level_sequence",
     "levenberg_marquardt",
     "limb_angles",
     "nearest_point",

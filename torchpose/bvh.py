@@ -1,7 +1,8 @@
 """The motion as BVH, for Blender, MotionBuilder, Unity and others: the body file's tree, the person's limb lengths.
 
-BVH's frame, right-handed: x to the left of a person who faces the camera, y up, z towards the camera; the origin stays
-in the left camera. Centimetres, degrees, frames at a constant rate.
+BVH's frame, right-handed: x to the left of a person who faces the camera, y up, z towards the camera. A levelled
+sequence (level.py) stands on the floor, y = 0; of any other the origin is the left camera, and up is the camera's up.
+Centimetres, degrees, frames at a constant rate.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""The joint centres as C3D, which motion laboratories exchange; written by `ezc3d`, which is asked for only here."""
+"""The joint centres as C3D, which motion laboratories exchange; written by `ezc3d`, which is asked for only here.
+
+OpenSim's frame, see opensim.py: on the floor and upright if the sequence was levelled, else the left camera's.
+"""
 
 from importlib.util import find_spec
 from pathlib import Path

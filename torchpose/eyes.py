@@ -282,11 +282,14 @@ class Eyes(nn.Module):
         return left, right
 
     def state(self) -> dict[str, Tensor]:
-        """What is remembered of the last frame, to go on from there; {} if there was none."""
+        """What is remembered of the last frame and of the floor, to go on from there; {} if there was neither."""
+        state = {}
+        if self.floor is not None:
+            state["floor"] = torch.cat([self.floor.normal, self.floor.height[None]])
         if self.last is None:
-            return {}
+            return state
         time_s = torch.tensor(self.last.time_s, dtype=torch.float64)
-        state = {"time_s": time_s, "silhouette": self.last.silhouette}
+        state |= {"time_s": time_s, "silhouette": self.last.silhouette}
         if self.last.face is not None:
             state |= {"face": self.last.face.box}
             state |= {f"skin_{name}": value for name, value in vars(self.last.face.skin).items()}
@@ -295,7 +298,10 @@ class Eyes(nn.Module):
     def restore(self, state: dict[str, Tensor], device: torch.device) -> None:
         """Take up what `state` gave."""
         self.last = None
-        if state:
+        if "floor" in state:  # only the files may be left to write: the empty scene is then not learned again
+            plane = state["floor"].to(device)
+            self.floor = Floor(plane[:3], plane[3])
+        if "time_s" in state:
             disparity, box = state.get("disparity"), state.get("face")
             skin = {name[5:]: value.to(device) for name, value in state.items() if name.startswith("skin_")}
             self.last = LastSight(

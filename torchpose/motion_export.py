@@ -15,8 +15,10 @@ from torchpose.body.model import BodyModel
 from torchpose.bvh import GAP, write_bvh
 from torchpose.c3d_file import check_c3d, write_c3d
 from torchpose.export import PoseSequence, write_poses_csv
+from torchpose.level import level_sequence
 from torchpose.opensim import write_mot, write_trc
 from torchpose.trajectory_filter import FilterKind, filter_sequence, usual_rate
+from torchpose.vision.floor import Floor
 
 
 class ExportFormat(Enum):
@@ -39,6 +41,7 @@ class ExportConfig:
     min_cutoff: float = 1.0  # Hz, of one_euro at rest
     beta: float = 2.0  # Hz for each m/s or rad/s, of one_euro: greater follows faster
     speed_cutoff: float = 1.0  # Hz, of the speed in one_euro
+    level: bool = True  # these files stand upright on the floor if it is seen, else in the camera's frame
     gap: float = GAP  # s; a BVH file bridges frames without a pose between two that are no further apart
 
     def __post_init__(self) -> None:
@@ -76,9 +79,11 @@ def export_motion(
     body: BodyModel,
     size: Float[Tensor, "1 sizes"],
     config: ExportConfig,
+    floor: Floor | None = None,
 ) -> dict[str, Any]:
     """Write `poses{mark}.mot` and its like into `folder`; with a filter, `poses{mark}_filtered.csv` too.
 
+    The files for other programs stand on the `floor` where it is known; the table stays in the left camera's frame.
     Returns, for each file that may not hold every pose, which is the BVH, its first frame, its number of frames, and
     how many of the recording's frames with a pose it leaves out.
     """
@@ -106,6 +111,8 @@ def export_motion(
             config.speed_cutoff,
         )
         write_poses_csv(folder / f"poses{mark}_filtered.csv", sequence)
+    if config.level and floor is not None:
+        sequence = level_sequence(sequence, floor)
     notes: dict[str, Any] = {}
     for kind in config.formats:
         path = folder / f"poses{mark}.{kind.value}"

@@ -1,8 +1,9 @@
 """Files for OpenSim 4: coordinates over time (.mot) and joint centres as markers (.trc).
 
 OpenSim's frame, right-handed: x forward, y up, z to the right, of a person who faces the camera; so x points from the
-scene to the camera. The origin stays in the left camera, and up is the camera's up. Names, axes and signs are those of
-the Rajagopal (2016) model, which OpenCap's models share; docs/angles.md has the table.
+scene to the camera. A levelled sequence (level.py) stands on the floor, y = 0; of any other the origin is the left
+camera, and up is the camera's up. Names, axes and signs are those of the Rajagopal (2016) model, which OpenCap's models
+share; docs/angles.md has the table.
 """
 
 from dataclasses import replace
@@ -13,9 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.body.angle import ANATOMICAL_NAMES
+from torchpose.body.angle import ANATOMICAL_NAMES, TRUNK_NAMES, trunk_turn
 from torchpose.export import JOINT_NAMES, PoseSequence, write_table
-from torchpose.geometry import exp_rotation
 from torchpose.resampling import frame_rate
 from torchpose.trajectory_filter import stretches
 
@@ -40,7 +40,6 @@ COORDINATES: tuple[tuple[str, str, int], ...] = (
     ("neck_lateral_bending", "neck_lateral_bending", 1),
 )
 PELVIS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis_ty", "pelvis_tz")
-_TRUNK = ("trunk_rotation", "trunk_flexion", "trunk_lateral_bending")
 # The names of Pose2Sim's HALPE_26 model, where they mean the same point.
 MARKERS: dict[str, str] = {
     "pelvis": "Hip",
@@ -145,7 +144,7 @@ def _pelvis(sequence: PoseSequence, column: dict[str, np.ndarray]) -> tuple[np.n
     """
     pieces = [
         _pelvis_of(
-            torch.stack([torch.from_numpy(column[name][start : start + _CHUNK]) for name in _TRUNK], -1),
+            torch.stack([torch.from_numpy(column[name][start : start + _CHUNK]) for name in TRUNK_NAMES], -1),
             sequence.joints[start : start + _CHUNK, JOINT_NAMES.index("pelvis")],
         )
         for start in range(0, max(len(sequence), 1), _CHUNK)
@@ -157,9 +156,7 @@ def _pelvis(sequence: PoseSequence, column: dict[str, np.ndarray]) -> tuple[np.n
 def _pelvis_of(
     angles: Float[Tensor, "time 3"], pelvis: Float[Tensor, "time 3"]
 ) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time 3"]]:
-    axes = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=torch.float64)
-    yaw, pitch, roll = exp_rotation(angles[..., None] * axes).unbind(-3)
-    R = (yaw @ pitch @ roll).flip(-1).flip(-2)  # both frames are turned alike, and the two signs cancel
+    R = trunk_turn(angles).flip(-1).flip(-2)  # both frames are turned alike, and the two signs cancel
     tilt, bow = torch.atan2(-R[:, 0, 1], R[:, 1, 1]), torch.asin(R[:, 2, 1].clamp(-1, 1))
     turn = torch.atan2(-R[:, 2, 0], R[:, 2, 2])
     offset = (R @ torch.tensor(_PELVIS_ORIGIN, dtype=torch.float64)[:, None])[..., 0]

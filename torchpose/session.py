@@ -42,6 +42,7 @@ from torchpose.report import Report
 from torchpose.rerun_log import depth_png
 from torchpose.terminal import Progress, coloured, table
 from torchpose.vision.alignment import alignment_warning, correction_warning, measure_alignment
+from torchpose.vision.floor import Floor
 from torchpose.window import PeopleWindows
 
 CHECKED = 3  # frames whose rows are compared
@@ -181,7 +182,7 @@ class Session:
 
         A person's `sequence` has no covariances; `points(position)` are of a part.
         """
-        notes: dict[str, Any] = {}
+        notes, floor = dict[str, Any](), self.model.eyes.floor
         for number, person in enumerate(found, 1):
             mark = "" if number == 1 else f"_{number}"
             model = self.people.followers[person.number].model
@@ -189,7 +190,7 @@ class Session:
             write_poses_npz(folder / f"poses{mark}.npz", person.sequence, person.covariances())
             plot_angles(folder / f"angles{mark}.png", person.sequence)
             write_size(folder / f"person{mark}.yaml", model.body, model.size)
-            notes |= export_motion(folder, mark, person.sequence, model.body, model.size, self.export)
+            notes |= export_motion(folder, mark, person.sequence, model.body, model.size, self.export, floor)
         people = [(self.people.followers[person.number].model, person) for person in found]
         draw_pictures(folder, self.recording, people, report, self.viz)
         return notes
@@ -260,6 +261,7 @@ class Session:
                 if bool(sequence.point_to_model.isfinite().any())
                 else float("nan"),
             },
+            "floor": _floor_entry(self.model.eyes.floor),
             "size": lengths,
             "seconds": seconds,
             "seconds_per_frame": seconds / max(frames, 1),
@@ -267,6 +269,14 @@ class Session:
             "problems": self.problems,
             "warnings": list(dict.fromkeys(self.told)),
         }
+
+
+def _floor_entry(floor: Floor | None) -> dict[str, Any] | None:
+    """A floor for the summary, with the angle by which the camera is off the level; None where none is known."""
+    if floor is None:
+        return None
+    tilt = math.degrees(math.acos(min(1.0, -float(floor.normal[1]))))
+    return {"normal": floor.normal.tolist(), "height_m": float(floor.height), "tilt_deg": tilt}
 
 
 def _depth_of(frame: FramePose) -> UInt8[np.ndarray, " bytes"]:

@@ -11,17 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.body.model import BodyModel, PosedBody
-from torchpose.geometry import angle_between
+from torchpose.geometry import angle_between, exp_rotation
 
 DRAWS = 128  # pairs of poses for the standard deviations of the angles
 SIDES = ("left", "right")
 LIMB_ANGLE_NAMES = tuple(
     f"{joint}_{side}_limb" for joint in ("elbow", "knee", "shoulder", "hip") for side in SIDES
 )
+TRUNK_NAMES = ("trunk_flexion", "trunk_lateral_bending", "trunk_rotation")
 ANATOMICAL_NAMES = (
-    "trunk_flexion",
-    "trunk_lateral_bending",
-    "trunk_rotation",
+    *TRUNK_NAMES,
     "neck_flexion",
     "neck_lateral_bending",
     *(f"shoulder_{motion}_{side}" for motion in ("flexion", "abduction", "rotation") for side in SIDES),
@@ -57,12 +56,8 @@ def anatomical_angles(body: BodyModel, posed: PosedBody) -> Float[Tensor, "batch
     leaves it undefined: its standard deviation then says so.
     """
     limb = dict(zip(body.body_names[1:], body.limb_directions(posed).unbind(1), strict=True))
-    # R = Ry(yaw) Rx(pitch) Rz(roll); a forward bend turns the upper body towards the camera: pitch > 0.
-    R = posed.rotations[:, 0]
     angles = [
-        _elevation(-R[:, 1, 2], R[:, 1, :2]),
-        -torch.atan2(R[:, 1, 0], R[:, 1, 1]),
-        torch.atan2(R[:, 0, 2], R[:, 2, 2]),
+        *trunk_angles(posed.rotations[:, 0]).unbind(1),
         torch.atan2(-limb["head"][:, 2], -limb["head"][:, 1]),
         -_elevation(limb["head"][:, 0], limb["head"][:, 1:]),
     ]
@@ -80,6 +75,24 @@ def anatomical_angles(body: BodyModel, posed: PosedBody) -> Float[Tensor, "batch
             angles += [ball[0][motion], ball[1][motion]]
         angles += hinge
     return torch.stack(angles, 1)
+
+
+def trunk_angles(R: Float[Tensor, "batch 3 3"]) -> Float[Tensor, "batch 3"]:
+    """Angles with the names of `TRUNK_NAMES` of a trunk that is turned by R, in whose frame y is down.
+
+    R = Ry(yaw) Rx(pitch) Rz(roll); a forward bend turns the upper body towards the camera: pitch > 0.
+    """
+    flexion = _elevation(-R[:, 1, 2], R[:, 1, :2])
+    return torch.stack(
+        [flexion, -torch.atan2(R[:, 1, 0], R[:, 1, 1]), torch.atan2(R[:, 0, 2], R[:, 2, 2])], 1
+    )
+
+
+def trunk_turn(angles: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
+    """R of a trunk with these angles: the inverse of `trunk_angles`."""
+    axes = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).to(angles)
+    pitch, roll, yaw = exp_rotation(angles[..., None] * axes).unbind(1)
+    return yaw @ pitch @ roll
 
 
 def _elevation(height: Float[Tensor, " batch"], level: Float[Tensor, "batch 2"]) -> Float[Tensor, " batch"]:

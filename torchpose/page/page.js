@@ -470,7 +470,7 @@
       line("Click or drag on a plot or on the time line: pictures, 3-D view and plots go to that moment. Numbers are degrees ± two standard deviations."),
       line(key("←"), " ", key("→"), " frame (with shift: 10), ", key("Home"), " ", key("End"), " ends, ", key("Page ↑"), " ", key("Page ↓"), " picture, ", key("space"), " plays."),
       line(key("+"), " ", key("−"), " ", key("0"), " zoom time, also ctrl-wheel on a plot. ", key("A"), " ", key("D"), " ", key("W"), " ", key("S"), " turn the 3-D view, ", key("Q"), " ", key("E"), " zoom it, ", key("R"), " resets it."),
-      line("3-D axes as in the files: x to the camera's right, y down, z away from it. The floor is not measured: the grid is laid under the feet, as far as they have moved."),
+      line("3-D axes as in poses.csv: x to the camera's right, y down, z away from it. The grid is laid under the feet, as far as they have moved."),
       line("The white part of the skeleton is the trunk. Frames without a pose are hatched: nothing is filled in.")));
     element("about").append(make("div", { class: "wide" }, make("details", {}, make("summary", {}, "Settings"), table(flat(summary.settings || {})))));
   }
