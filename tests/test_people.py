@@ -1,6 +1,7 @@
 """What is known of people beside their poses: the way they walk, how tall they are, where they come in."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -103,6 +104,12 @@ def test_somebody_reaches_from_the_floor_to_the_crown(people, monkeypatch, lowes
     sight, floor = upright(1.75, lowest, lean)
     monkeypatch.setattr(people.model.eyes, "floor", floor)
     assert_close(people.model.height_in(sight), 1.75 + RIM, atol=0.02, rtol=0)
+
+
+def test_a_table_is_not_what_somebody_behind_it_stands_on(people, monkeypatch):
+    sight, floor = upright(1.80, 0.0)
+    monkeypatch.setattr(people.model.eyes, "floor", replace(floor, height=floor.height - 0.7))
+    assert_close(people.model.height_in(sight), 1.80 + 2 * RIM, atol=0.04, rtol=0)
 
 
 def test_without_a_floor_feet_may_be_missing(people, monkeypatch):

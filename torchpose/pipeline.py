@@ -50,6 +50,7 @@ from torchpose.vision.points import CellConfig, group_cells
 RIM = (
     0.015  # m by which a cloud falls short of a person at the head, and at the feet: half a step of its grid
 )
+BELOW = 0.2  # m by which points may lie below a floor; somebody who reaches further down does not stand on it
 SITTING = 0.76  # of the body file's height: whoever looks shorter sits or stoops
 WHOLE_SIGHTS = 2  # of all of somebody, that tell the size
 
@@ -228,16 +229,18 @@ class StereoToPose(nn.Module):
     def height_in(self, sight: Sight) -> float:
         """How tall somebody is in a sight, m: NaN where no point lies below the head.
 
-        From the head's top down to the floor. Where no floor is seen, down to the lowest point: feet that cannot be
-        told from the floor are missing then, so it is `least_height` at least.
+        From the head's top down to the floor. Where no floor is seen, or what was taken for it is a table that
+        somebody stands behind, down to the lowest point: feet that cannot be told from the floor are missing then,
+        so it is `least_height` at least.
         """
         points = sight.cloud.points[0][sight.cloud.mask[0]]
         center = sight.faces.position[0, 0] if bool(sight.faces.found[0]) else points.median(0).values[0]
         column = points[(points[:, 0] - center).abs() < 0.12]  # raised hands are beside the head
         if not len(column):
             return math.nan
-        if self.eyes.floor is not None:
-            return float(torch.quantile(self.eyes.floor.above(column), 0.99)) + RIM
+        floor = self.eyes.floor
+        if floor is not None and float(floor.above(points).quantile(0.01)) > -BELOW:
+            return float(floor.above(column).quantile(0.99)) + RIM
         extent = torch.quantile(points[:, 1], 0.99) - torch.quantile(column[:, 1], 0.01)
         least = self.config.least_height if float(extent) > SITTING * self.body.height else 0.0
         return max(float(extent) + 2 * RIM, least)
