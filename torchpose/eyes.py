@@ -52,7 +52,7 @@ GLANCES = 5  # frames of the recording that see whether somebody stands in its b
 SURE = 3.0  # log-odds of a depth reading that is nobody's noise
 PURE = 0.75  # share of a depth reading that must be the person's: with less it lies behind the body's surface
 NEARER, FARTHER = 0.1, 0.95  # of a person's points, that are nearer than where the person begins and ends
-FOOT = 0.1  # m: what is nearer to the scene is hardly told from it
+FOOT = 0.1  # m by which a foot is before the scene
 SURE_SD = 3.0  # standard deviations of a depth, by which it is surely another one
 UNSEEN_FEET = 0.25  # m above the floor, from which on legs are seen
 NOBODY = -1e3  # log-odds of a pixel that has been given to somebody
@@ -217,8 +217,8 @@ class Eyes(nn.Module):
     ) -> Bool[Tensor, "1 height width"]:
         """Where somebody (batch 1) may be: the silhouette, and what is `covered` by something nearer.
 
-        Of whoever stands before a depth camera also where the floor is as near as he or she, for there feet cannot be
-        told from it; and nothing below the floor. For stereo colour tells them apart.
+        Of whoever stands before a noisy depth camera also where the floor is as near as he or she, for there feet
+        cannot be told from it; and nothing below the floor. For stereo colour tells them apart.
         """
         allowed = sight.silhouette if covered is None else sight.silhouette | covered
         points = sight.cloud.points[0][sight.cloud.mask[0]]
@@ -227,7 +227,10 @@ class Eyes(nn.Module):
         if float(self.floor.above(points).quantile(0.01)) > UNSEEN_FEET:
             return allowed
         near, far = (float(points[:, 2].quantile(share)) for share in (NEARER, FARTHER))
-        untold = self.background.depth < far + FOOT + SURE_SD * self.depth_noise * far**2
+        doubt = SURE_SD * self.depth_noise * far**2
+        if doubt < FOOT:
+            return allowed
+        untold = self.background.depth < far + FOOT + doubt
         return sight.silhouette | ((allowed | untold) & self.floor.pixels_above(self.camera, near))
 
     def learn_background(self, backgrounds: Backgrounds, recording: Recording, device: torch.device) -> None:

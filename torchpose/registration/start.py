@@ -51,7 +51,7 @@ class StartConfig:
     finalists: int = 4
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
     exchanged: int = 8  # best starts whose limbs are exchanged
-    apart: float = 0.05  # rad by which limbs differ that are exchanged: the others end in the same place
+    apart: float = 0.0  # rad by which limbs differ that are exchanged: the others end in the same place
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
     # m, in a refresh's first rounds on few points and on all: all but a limb or two are right
