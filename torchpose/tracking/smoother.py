@@ -295,10 +295,8 @@ def walking_yaw(
 
     `place` is in the left camera's frame, m. Frames near the ends have but half of that time; with less it is NaN.
     """
-    reach = walk / 2 + 1e-6
-    near = (
-        time_s[:, None] - time_s
-    ).abs() <= reach  # time rises: the first and the last one of a row are its ends
+    near = (time_s[:, None] - time_s).abs() <= walk / 2 + 1e-6
+    # Time rises: the first and the last one of a row are its ends.
     first = near.to(torch.uint8).argmax(1)
     last = len(time_s) - 1 - near.flip(1).to(torch.uint8).argmax(1)
     elapsed, way = (time_s[last] - time_s[first]).to(place), place[last] - place[first]
