@@ -10,6 +10,7 @@ from torchpose.vision.camera import StereoCamera
 from torchpose.vision.floor import Floor, FloorConfig, find_floor
 
 CAMERA = StereoCamera(160, 120, 150.0, 80.3, 59.6, None, 30.0)
+WALL = 5.0  # m away, square to the view
 
 
 def rays(camera: StereoCamera = CAMERA) -> torch.Tensor:
@@ -33,12 +34,14 @@ def tilted(pitch: float, roll: float) -> torch.Tensor:
     )
 
 
-def scene(up: torch.Tensor, height: float, wall: float = 5.0, table: float | None = None) -> torch.Tensor:
-    """Floor, a wall square to the view, and a table of that height over the floor in the left half."""
-    depth = depth_of(up, height).clamp_max(wall)
+def scene(
+    up: torch.Tensor, height: float, wall: float = 5.0, table: float | None = None, wide: int = 70
+) -> torch.Tensor:
+    """Floor, a wall square to the view, and a table of that height over the floor in the `wide` left columns."""
+    depth = depth_of(up, height).clamp_max(WALL)
     if table is not None:
         top = depth_of(up, height - table)
-        left = torch.arange(CAMERA.width) < 70
+        left = torch.arange(CAMERA.width) < wide
         depth = torch.where(left & (top < 2.4), torch.minimum(top, depth), depth)
     return depth
 
@@ -55,12 +58,21 @@ def test_a_drawn_floor_is_found(pitch, roll, height):
     assert_close(float(floor.height), height, atol=0.01, rtol=0)
 
 
-def test_the_floor_is_below_the_table():
+@pytest.mark.parametrize("wide", [70, 120])
+def test_the_floor_is_below_the_table(wide):
+    """Also where the table shows more readings than the floor: the floor has nothing below it."""
     up = tilted(10, 0)
-    with_table = scene(up, 1.4, table=0.75)
-    assert (with_table < scene(up, 1.4)).double().mean() > 0.1  # it hides more of the floor than is left
+    bare, with_table = scene(up, 1.4), scene(up, 1.4, table=0.75, wide=wide)
+    share = (with_table < bare).double().mean() / (bare < WALL).double().mean()
+    assert (share > 0.5) == (wide == 120)
     floor = find_floor(with_table, CAMERA)
-    assert_close(float(floor.height), 1.4, atol=5e-3, rtol=0)
+    assert_close(float(floor.height), 1.4, atol=0.01, rtol=0)
+
+
+def test_the_desk_that_the_camera_stands_on_is_no_floor():
+    desk = depth_of(tilted(10, 0), 0.12).clamp_max(4.0)
+    assert find_floor(desk, CAMERA) is None
+    assert find_floor(desk, CAMERA, config=FloorConfig(lowest=0.1)) is not None
 
 
 def test_noise_of_a_depth_camera_moves_it_by_little():

@@ -8,8 +8,8 @@ import torch
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
-from torchpose.eyes import Sight
-from torchpose.people import People, PeopleConfig, _at_border
+from torchpose.eyes import Sight, View
+from torchpose.people import Follower, People, PeopleConfig, _at_border
 from torchpose.pipeline import RIM, StereoToPose
 from torchpose.tracking.location import sighting
 from torchpose.vision.camera import StereoCamera
@@ -110,6 +110,30 @@ def test_a_table_is_not_what_somebody_behind_it_stands_on(people, monkeypatch):
     sight, floor = upright(1.80, 0.0)
     monkeypatch.setattr(people.model.eyes, "floor", replace(floor, height=floor.height - 0.7))
     assert_close(people.model.height_in(sight), 1.80 + 2 * RIM, atol=0.04, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "with_floor", "without"),
+    [
+        (slice(20, 100), slice(60, 90), True, True),  # whole
+        (slice(20, 120), slice(60, 90), True, False),  # cut below
+        (slice(0, 100), slice(60, 90), False, False),  # cut above
+        (slice(20, 100), slice(130, 160), False, False),  # coming in
+    ],
+)
+def test_a_newcomer_is_measured_where_the_head_shows(people, monkeypatch, rows, columns, with_floor, without):
+    whole, floor = upright(1.75, 0.0)
+    mask = torch.zeros(1, 120, 160, dtype=torch.bool)
+    mask[:, rows, columns] = True
+    edges = mask[0, [0, -1]].any() | mask[0, :, [0, -1]].any()
+    depth = torch.where(mask, 3.0, 5.0)
+    sight = replace(whole, silhouette=mask, cut=bool(edges))
+    view = View(sight.images, depth, mask, True)
+    for known, measured in ((floor, with_floor), (None, without)):
+        monkeypatch.setattr(people.model.eyes, "floor", known)
+        follower = Follower(people.model, sized=False)
+        people._measure_height(follower, sight, view)
+        assert len(follower.heights) == measured
 
 
 def test_without_a_floor_feet_may_be_missing(people, monkeypatch):
