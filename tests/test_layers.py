@@ -63,6 +63,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "vem",
         "size",
         "limb_search",
+        "walk",
         "start",
         "limb_score",
     ),

@@ -153,6 +153,6 @@ def test_the_sides_of_the_image_are_where_people_come_in():
 
 
 def test_wrong_settings_are_told():
-    with pytest.raises(ValueError, match="walking_speed must be positive"):
-        PeopleConfig(walking_speed=0.0)
+    with pytest.raises(ValueError, match="apart must be positive"):
+        PeopleConfig(apart=0.0)
     assert math.isfinite(PeopleConfig().appearing)

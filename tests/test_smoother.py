@@ -17,6 +17,7 @@ from torchpose.registration.fitting import FittingConfig, PosePrior, equations_b
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.start import turned_by
 from torchpose.registration.vem import Registrar, Registration, RegistrationConfig
+from torchpose.registration.walk import WalkConfig
 from torchpose.tracking.limb_hypothesis import HypothesisConfig
 from torchpose.tracking.smoother import (
     Chain,
@@ -26,7 +27,6 @@ from torchpose.tracking.smoother import (
     _unwound,
     fit_chain,
     solve_chain,
-    walking_yaw,
 )
 
 P = 3  # unknowns of a frame in the linear problems
@@ -625,34 +625,6 @@ def test_bad_times_are_told(body, scene, time_s):
         )
 
 
-@pytest.mark.parametrize("heading", [0.0, 1.5, -2.4, 3.1])
-def test_the_way_somebody_goes_is_where_a_body_of_that_yaw_faces(body, heading):
-    """Out of the body's chest, by the model, and along the path, by its own making, are one direction."""
-    time_s = torch.tensor([0.0, 0.1, 0.2, 0.35, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0, 1.1], dtype=torch.float64)
-    pose = standing(body, yaw=heading)
-    hips, knee = (body.joint_names.index(name) for name in ("hip_left", "hip_right"))
-    across = (body(pose).joints[0, hips] - body(pose).joints[0, knee]).double()  # to the left
-    ahead = torch.tensor([across[2], 0.0, -across[0]])  # a quarter turn to the right of it
-    place = 0.9 * time_s[:, None].float() * torch.nn.functional.normalize(ahead.float(), dim=0)
-    found = walking_yaw(time_s, place, 0.8, 0.5)
-    assert torch.isfinite(found).all()
-    assert_close(found.sin(), torch.full_like(found, math.sin(heading)), atol=1e-4, rtol=0)
-    assert_close(found.cos(), torch.full_like(found, math.cos(heading)), atol=1e-4, rtol=0)
-    assert walking_yaw(time_s, place / 2, 0.8, 0.5).isnan().all()  # 0.45 m/s is no walk
-
-
-def test_a_way_is_told_by_what_is_near_in_time_alone():
-    time_s = 0.1 * torch.arange(21, dtype=torch.float64)
-    x = torch.where(time_s < 1, time_s, 2 - time_s).float()  # there and back
-    place = torch.stack([x, 0 * x, 0 * x], 1)
-    found = walking_yaw(time_s, place, 0.8, 0.5)
-    assert_close(found[:7], torch.full((7,), -torch.pi / 2))
-    assert_close(found[14:], torch.full((7,), torch.pi / 2))
-    assert found[10].isnan()
-    assert walking_yaw(time_s[:4], place[:4], 0.8, 0.5).isnan().all()  # 0.3 s tell nothing
-    assert walking_yaw(time_s[:1], place[:1], 0.8, 0.5).isnan().all()
-
-
 def test_who_was_taken_for_walking_backwards_is_turned_to_the_way(body):
     """Seen exactly; three frames of a walk begin turned round, with the limbs where they are."""
     time_s, T = times(9), 9
@@ -668,6 +640,6 @@ def test_who_was_taken_for_walking_backwards_is_turned_to_the_way(body):
     assert ((tracked.pose[wrong, 3] - truth[wrong, 3]).cos() < 0).all()
     found = Smoother(body, registrar)(observation, time_s, tracked, size).registration
     assert ((found.pose[:, 3] - truth[:, 3]).cos() > 0.9).all()
-    off = SmoothingConfig(backwards_penalty=0.0)
+    off = SmoothingConfig(walk=WalkConfig(backwards_penalty=0.0))
     kept = Smoother(body, registrar, off)(observation, time_s, tracked, size).registration
     assert ((kept.pose[wrong, 3] - truth[wrong, 3]).cos() < 0.9).any()

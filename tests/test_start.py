@@ -243,7 +243,7 @@ def test_going_backwards_must_fit_better(body, starter):
     found = starter.registrar(view.observation(), standing(body).repeat(3, 1), body.default_size(1))
     found = replace(found, pose=pose)
     costs = starter.score(found, walking=0.5) - starter.score(found)
-    penalty = starter.config.backwards_penalty
+    penalty = starter.config.walk.backwards_penalty
     assert_close(costs, torch.tensor([0.0, penalty / 2, penalty]), atol=1e-4, rtol=0)
 
 

@@ -20,6 +20,7 @@ from torchpose.eyes import Sight, View
 from torchpose.pipeline import FramePose, StereoToPose
 from torchpose.recording import Frame, Recording, UnreadableFrame
 from torchpose.registration.vem import Observation, Registration
+from torchpose.registration.walk import yaw_of_way
 from torchpose.tracking.kalman import Gaussian
 from torchpose.tracking.location import (
     Location,
@@ -39,7 +40,6 @@ from torchpose.vision.skin import SkinModel
 from torchpose.vision.trunk import TrunkConfig, find_trunk
 from torchpose.window import PeopleWindows
 
-WALK = 0.8  # s over which somebody's way is measured
 TOUCHING = 3  # px between somebody and what may hide a part
 HIDING = (
     1.2  # of the root of somebody's pixels, beside which something nearer stands; fewer are noise and floor
@@ -75,7 +75,6 @@ class PeopleConfig:
         3.0  # times that, for whoever does not come in at the image's border, and was just there
     )
     scraps: float = 0.2  # of a newcomer's pixels; who has fewer may be the newcomer
-    walking_speed: float = 0.5  # m/s, from which somebody faces the way he or she goes
     arrival: int = 3  # frames in which somebody further must be seen, before a pose is sought
     size_apart: float = 0.4  # s between the frames from which the size is measured on the way
 
@@ -88,7 +87,6 @@ class PeopleConfig:
             "apart",
             "middle_sd",
             "strangeness",
-            "walking_speed",
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -112,7 +110,7 @@ class Follower:
         self.seen = 0  # frames with points
         self.known = False  # whether this person was ever there
         self.sized = sized
-        # s, and m to the right and away, of the trunk in the last `WALK` s
+        # s, and m to the right and away, of the trunk in the last of a walk's span
         self.trail: Float[Tensor, "places 3"] = torch.zeros(0, 3, dtype=torch.float64)
         self.heights: list[float] = []  # m, in frames that show all of the person
         self.samples: list[tuple[float, Observation, Registration]] = []  # for the size
@@ -287,10 +285,9 @@ class People:
         trail = follower.trail
         if not self._located(follower, time_s) or len(trail) < 2:
             return None
-        elapsed, way = float(trail[-1, 0] - trail[0, 0]), trail[-1, 1:] - trail[0, 1:]
-        if elapsed < 0.5 * WALK or float(way.norm()) < self.config.walking_speed * elapsed:
-            return None
-        return math.atan2(-float(way[0]), -float(way[1]))
+        gone = trail[-1] - trail[0]
+        yaw = float(yaw_of_way(gone[0], gone[1:], self.model.config.start.walk))
+        return None if math.isnan(yaw) else yaw
 
     def _expected(self, follower: Follower, time_s: float) -> PosedBody | None:
         """Where the person's body should be at `time_s`; None if nobody knows."""
@@ -466,7 +463,7 @@ class People:
         follower.location = step.location
         place = [time_s, *step.location.body.mean[0, [0, 2]].tolist()]
         trail = torch.cat([follower.trail, follower.trail.new_tensor([place])])
-        follower.trail = trail[trail[:, 0] >= time_s - WALK]
+        follower.trail = trail[trail[:, 0] >= time_s - self.model.config.start.walk.span]
 
     def _covered(
         self, follower: Follower, view: View, masks: list[Tensor], own: int, time_s: float

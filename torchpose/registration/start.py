@@ -16,6 +16,7 @@ from torchpose.registration.fitting import PosePrior
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
 from torchpose.registration.vem import Observation, Registrar, Registration, RegistrationConfig
+from torchpose.registration.walk import WalkConfig, backwards_cost
 from torchpose.vision.faces import Faces
 from torchpose.vision.points import PointCloud
 
@@ -61,7 +62,7 @@ class StartConfig:
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
     back_penalty: float = 4.0  # nats that a pose turned away from the camera must make good
     walking_yaws: tuple[float, ...] = (-35.0, 0.0, 35.0, 180.0)  # degrees from the way that somebody walks
-    backwards_penalty: float = 15.0  # nats that a pose turned against the way somebody walks must make good
+    walk: WalkConfig = field(default_factory=WalkConfig)
 
     def __post_init__(self) -> None:
         for name in ("points", "rounds", "final_rounds", "finalists", "exchanged"):
@@ -71,11 +72,8 @@ class StartConfig:
             raise ValueError(f"apart must not be negative, got {self.apart}; 0 exchanges all limbs")
         if not (self.yaws and self.face_yaws and self.walking_yaws):
             raise ValueError("yaws, face_yaws and walking_yaws need at least one angle each, in degrees")
-        if not (self.back_penalty >= 0 and self.backwards_penalty >= 0):
-            raise ValueError(
-                "back_penalty and backwards_penalty must not be negative, "
-                f"got {self.back_penalty} and {self.backwards_penalty}"
-            )
+        if not self.back_penalty >= 0:
+            raise ValueError(f"back_penalty must not be negative, got {self.back_penalty} nats")
 
 
 class Starter(nn.Module):
@@ -191,7 +189,7 @@ class Starter(nn.Module):
         score = found.score.nan_to_num(nan=torch.inf)
         score = score + self.config.back_penalty * self._turned_away(found.pose)
         if walking is not None:
-            score = score + self.config.backwards_penalty * (1 - (found.pose[:, 3] - walking).cos()) / 2
+            score = score + backwards_cost(found.pose[:, 3], walking, self.config.walk)
         return score
 
     def hypotheses(

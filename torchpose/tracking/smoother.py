@@ -17,6 +17,7 @@ from torchpose.least_squares import NormalEquations, Status
 from torchpose.registration.fitting import PoseEquations, PosePrior, equations_by_moments
 from torchpose.registration.start import turned_by
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
+from torchpose.registration.walk import WalkConfig, backwards_cost, walking_yaw
 from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses, unoccluded
 
 ANGLES = slice(3, 6)  # of the root, which come round again
@@ -32,11 +33,9 @@ class SmoothingConfig:
     steps: int = 2  # of Gauss and Newton in each
     joint_drift: float = 1.0  # rad that a joint goes astray in a second, growing with the root of time
     root_drift: float = 0.5  # m and rad, the same for the root
-    walk: float = 0.8  # s over which somebody's way is measured
-    walking_speed: float = 0.5  # m/s, from which somebody faces the way
+    walk: WalkConfig = field(default_factory=WalkConfig)
     aside: float = 0.7  # rad off that way, from which a frame is also fitted facing it
     facing_rounds: int = 5  # of this
-    backwards_penalty: float = 15.0  # nats that going backwards must make good; 0 switches this off
     stretch: int = 50  # frames that are smoothed at once
     ahead: int = 12  # coming frames that they hear of
     rest_time: float = 2.0  # s after which an unseen limb forgets where it was
@@ -54,12 +53,12 @@ class SmoothingConfig:
             raise ValueError(
                 f"0 <= ahead < stretch must hold, in frames, got {self.ahead} and {self.stretch}"
             )
-        for name in ("joint_drift", "root_drift", "rest_time", "walk", "walking_speed", "aside"):
+        for name in ("joint_drift", "root_drift", "rest_time", "aside"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.facing_rounds < 1:
             raise ValueError(f"facing_rounds must be at least 1, got {self.facing_rounds}")
-        for name in ("offset_sd", "slide_sd", "backwards_penalty"):
+        for name in ("offset_sd", "slide_sd"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}; 0 switches it off")
         if not self.piece >= 1:
@@ -164,7 +163,7 @@ class Smoother(nn.Module):
         # Before anything compares poses of neighbours: a turn of 2 pi between them is none.
         sound = is_finite(tracked)
         pose = _without_gaps(tracked.pose, sound)
-        if self.config.backwards_penalty > 0:
+        if self.config.walk.backwards_penalty > 0:
             tracked = self._face_the_way(observation, replace(tracked, pose=pose), time_s, size)
             pose = tracked.pose
         pose = torch.cat([pose[:, :3], _unwound(pose[:, ANGLES], before), pose[:, 6:]], 1)
@@ -206,14 +205,14 @@ class Smoother(nn.Module):
         Tracking hears of the way only when some of it is gone.
         """
         config, nothing = self.config, torch.zeros_like(now.pose)
-        way = walking_yaw(time_s, now.pose[:, :3], config.walk, config.walking_speed)
+        way = walking_yaw(time_s, now.pose[:, :3], config.walk)
         off = torch.remainder(way - now.pose[:, 3] + torch.pi, 2 * torch.pi) - torch.pi
         rows = (off.abs() > config.aside).nonzero()[:, 0]
         sizes = size.expand(len(time_s), -1)
 
         def judged(found: Registration, part: Tensor) -> Tensor:
-            against = (1 - (found.pose[:, 3] - way[part]).cos()) / 2
-            return found.score.nan_to_num(nan=torch.inf) + config.backwards_penalty * against
+            against = backwards_cost(found.pose[:, 3], way[part], config.walk)
+            return found.score.nan_to_num(nan=torch.inf) + against
 
         for part in rows.split(MOST) if len(rows) else ():
             seen, own = observation.share(part), now.pose[part]
@@ -286,22 +285,6 @@ class Smoother(nn.Module):
         if len(time_s) < 2:
             return 1.0
         return float(time_s.diff().mean().clamp(1e-3, self.config.rest_time)) / self.config.rest_time
-
-
-def walking_yaw(
-    time_s: Float[Tensor, " frames"], place: Float[Tensor, "frames 3"], walk: float, speed: float
-) -> Float[Tensor, " frames"]:
-    """Yaw of the way that somebody goes within `walk` s about each frame, rad; NaN of whoever is slower than `speed`.
-
-    `place` is in the left camera's frame, m. Frames near the ends have but half of that time; with less it is NaN.
-    """
-    near = (time_s[:, None] - time_s).abs() <= walk / 2 + 1e-6
-    # Time rises: the first and the last one of a row are its ends.
-    first = near.to(torch.uint8).argmax(1)
-    last = len(time_s) - 1 - near.flip(1).to(torch.uint8).argmax(1)
-    elapsed, way = (time_s[last] - time_s[first]).to(place), place[last] - place[first]
-    there = (elapsed >= 0.5 * walk - 1e-6) & (way[:, [0, 2]].norm(dim=1) >= speed * elapsed)
-    return torch.where(there, torch.atan2(-way[:, 0], -way[:, 2]), torch.nan)
 
 
 def fit_chain(
