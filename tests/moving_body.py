@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 
 from torchpose.body.angle import ANATOMICAL_NAMES, LIMB_ANGLE_NAMES, anatomical_angles, limb_angles
@@ -17,6 +18,28 @@ def in_double(kind: JointKind) -> BodyModel:
         return BodyModel(BodyConfig(joint=kind))
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+def body_fixture():
+    """The fixture `body`: with either kind of joints, in double precision."""
+
+    @pytest.fixture(
+        scope="module", params=[JointKind.anatomical, JointKind.swing], ids=lambda kind: kind.value
+    )
+    def body(request: pytest.FixtureRequest) -> BodyModel:
+        return in_double(request.param)
+
+    return body
+
+
+def size_fixture():
+    """The fixture `size`: somebody whose every length is another share of the body file's."""
+
+    @pytest.fixture(scope="module")
+    def size(body: BodyModel) -> torch.Tensor:
+        return torch.linspace(0.85, 1.15, len(body.size_names), dtype=torch.float64)[None]
+
+    return size
 
 
 def moving(body: BodyModel, size: torch.Tensor, time: int = 24, gone: tuple[int, ...] = ()) -> PoseSequence:

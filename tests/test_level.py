@@ -11,14 +11,14 @@ import bvhio
 import numpy as np
 import pytest
 import torch
-from moving_body import in_double, moving
+from moving_body import body_fixture, moving, size_fixture
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 import torchpose as tp
 from torchpose import level as module
 from torchpose.body.angle import TRUNK_NAMES, anatomical_angles, limb_angles, trunk_angles, trunk_turn
-from torchpose.body.model import BodyModel, JointKind
+from torchpose.body.model import BodyModel
 from torchpose.cli import load_config
 from torchpose.export import JOINT_NAMES, PoseSequence
 from torchpose.level import level_sequence, rotation_to_floor
@@ -35,15 +35,7 @@ CAMERAS = [(0, 0, 0.8), (14, 0, 1.2), (0, 12, 1.0), (30, 5, 1.6), (-9, -20, 0.5)
 TRUNK = slice(0, 3)  # of the anatomical angles
 
 
-@pytest.fixture(scope="module", params=[JointKind.anatomical, JointKind.swing], ids=lambda kind: kind.value)
-def body(request: pytest.FixtureRequest) -> BodyModel:
-    return in_double(request.param)
-
-
-@pytest.fixture(scope="module")
-def size(body: BodyModel) -> torch.Tensor:
-    """Somebody whose every length is another share of the body file's."""
-    return torch.linspace(0.85, 1.15, len(body.size_names), dtype=torch.float64)[None]
+body, size = body_fixture(), size_fixture()
 
 
 def axes_of(pitch: float, roll: float) -> np.ndarray:

@@ -10,10 +10,10 @@ import ezc3d
 import numpy as np
 import pytest
 import torch
-from moving_body import RATE, in_double, moving
+from moving_body import RATE, body_fixture, moving, size_fixture
 
 from torchpose import c3d_file
-from torchpose.body.model import BodyModel, JointKind
+from torchpose.body.model import BodyModel
 from torchpose.bvh import write_bvh
 from torchpose.c3d_file import write_c3d
 from torchpose.cli import infer_main
@@ -23,16 +23,7 @@ from torchpose.opensim import MARKERS, to_opensim
 from torchpose.session import summary_table
 from torchpose.trajectory_filter import FilterKind, filter_sequence
 
-
-@pytest.fixture(scope="module", params=[JointKind.anatomical, JointKind.swing], ids=lambda kind: kind.value)
-def body(request: pytest.FixtureRequest) -> BodyModel:
-    return in_double(request.param)
-
-
-@pytest.fixture(scope="module")
-def size(body: BodyModel) -> torch.Tensor:
-    """Somebody whose every length is another share of the body file's."""
-    return torch.linspace(0.85, 1.15, len(body.size_names), dtype=torch.float64)[None]
+body, size = body_fixture(), size_fixture()
 
 
 class TestBvh:

@@ -13,26 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from moving_body import RATE, in_double, moving
+from moving_body import RATE, body_fixture, moving, size_fixture
 from scipy.spatial.transform import Rotation
 
 from torchpose.body.angle import ANATOMICAL_NAMES
-from torchpose.body.model import BodyModel, JointKind
+from torchpose.body.model import BodyModel
 from torchpose.export import JOINT_NAMES
 from torchpose.opensim import COORDINATES, MARKERS, PELVIS, to_opensim, write_mot, write_trc
 
 SIDES = ("left", "right")
 
 
-@pytest.fixture(scope="module", params=[JointKind.anatomical, JointKind.swing], ids=lambda kind: kind.value)
-def body(request: pytest.FixtureRequest) -> BodyModel:
-    return in_double(request.param)
-
-
-@pytest.fixture(scope="module")
-def size(body: BodyModel) -> torch.Tensor:
-    """Somebody whose every length is another share of the body file's."""
-    return torch.linspace(0.85, 1.15, len(body.size_names), dtype=torch.float64)[None]
+body, size = body_fixture(), size_fixture()
 
 
 def read_mot(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
