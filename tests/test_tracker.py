@@ -9,6 +9,7 @@ from synthetic_cloud import RELAXED, see, standing
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
+from torchpose.cli import load_config
 from torchpose.least_squares import Status
 from torchpose.registration.start import StartConfig, Starter
 from torchpose.registration.vem import Registrar, Registration, RegistrationConfig
@@ -544,3 +545,18 @@ def test_crossed_legs_are_also_sought_uncrossed(body, scripted, view):
     assert_close(after[knees], before[knees[::-1]], atol=2e-2, rtol=0)
     assert_close(after[ankles], before[ankles[::-1]], atol=3e-2, rtol=0)
     assert_close(second[:, :6], crossed[:, :6])
+
+
+def test_the_thesis_starts_where_the_last_frame_ended_and_nowhere_else(body, scripted, view):
+    """Whatever legs are crossed, however noisy depths are, and whichever way somebody walks."""
+    tracker, registrar, _ = scripted
+    directions = RELAXED.clone()
+    directions[5:7] = torch.tensor([[-0.25, 1.0, -0.1], [-0.1, 1.0, 0.0]])
+    directions[7:9] = torch.tensor([[0.25, 1.0, -0.1], [0.1, 1.0, 0.0]])
+    crossed = standing(body, directions)
+    noisy = replace(view.observation(), depth_noise=0.01)
+    tracker.config = load_config("infer", ["registration=thesis"]).pose.tracking
+    for walking in (None, 1.5, 3.0):
+        tracker.begin(crossed, 0.0)
+        tracker(0.1, noisy, view.no_face(), body.default_size(1), walking=walking)
+        assert_close(registrar.starts, crossed.expand(2, -1))

@@ -49,6 +49,7 @@ class TrackingConfig:
     against: float = 1.75  # rad off the way somebody walks, from which the other way round is tried, too
     aside: float = 0.35  # rad off that way, from which a start faces it
     profile: float = 0.8  # sine of that way against the camera's, from which it is seen in profile
+    uncross: bool = True  # crossed legs are also tried uncrossed
     search_slack: float = (
         3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
     )
@@ -236,7 +237,7 @@ class Tracker(nn.Module):
             sides = directions[:, other_side(self.body)]
             other = self.body.pose_from_directions(root[:, :3], root[:, 3:], sides)
             return replace(expected, starts=torch.cat([predicted, other]))
-        uncrossed = legs_uncrossed(self.body, predicted, person.size)
+        uncrossed = legs_uncrossed(self.body, predicted, person.size) if self.config.uncross else None
         return expected if uncrossed is None else replace(expected, starts=torch.cat([predicted, uncrossed]))
 
     def seeks_limbs(self, person: "Sought", found: Registration) -> bool:
