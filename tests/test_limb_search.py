@@ -114,3 +114,32 @@ def test_points_that_are_not_numbers_still_give_places(scene):
 def test_bad_settings_are_told(setting, message):
     with pytest.raises(ValueError, match=message):
         LimbSearchConfig(**setting)
+
+
+def test_half_of_the_points_weigh_as_much_as_all(scene):
+    """Of points that stand twice every other one says what all say, to first order nearly what is exact."""
+    body, _, _, pose, _ = scene
+    observation, size = see(body, pose, num=200).observation(), body.default_size(1)
+    alone = LimbSearch(body, Registrar(body, RegistrationConfig(rim=RimConfig(weight=0.0))))
+    rest = alone._rest_of_body(observation, pose, size)
+    places = alone.places[None]
+    exact = alone._score(observation, pose, places, size, rest, exact=True)
+    twice = torch.arange(observation.cloud.mask.shape[1]).repeat_interleave(2)
+    cloud = observation.cloud
+    doubled = replace(
+        observation,
+        cloud=replace(
+            cloud,
+            points=cloud.points[:, twice],
+            pixels=cloud.pixels[:, twice],
+            grid=cloud.grid[:, twice],
+            mask=cloud.mask[:, twice],
+            neighbours=cloud.neighbours[:, twice],
+        ),
+        potential=observation.potential[:, twice],
+    )
+    rough = alone._score(doubled, pose, places, size, rest[..., twice], exact=False)
+    x, y = (score - score.mean(2, keepdim=True) for score in (exact, rough))
+    slope = (x * y).sum(2) / x.square().sum(2)
+    assert ((slope > 0.8) & (slope < 1.25)).all()
+    assert ((x * y).sum(2) / (x.norm(dim=2) * y.norm(dim=2)) > 0.95).all()

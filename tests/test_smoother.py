@@ -17,7 +17,7 @@ from torchpose.registration.fitting import FittingConfig, PosePrior, equations_b
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.start import turned_by
 from torchpose.registration.vem import Registrar, Registration, RegistrationConfig
-from torchpose.registration.walk import WalkConfig
+from torchpose.registration.walk import WalkConfig, walking_yaw
 from torchpose.tracking.limb_hypothesis import HypothesisConfig
 from torchpose.tracking.smoother import (
     Chain,
@@ -643,3 +643,18 @@ def test_who_was_taken_for_walking_backwards_is_turned_to_the_way(body):
     off = SmoothingConfig(walk=WalkConfig(backwards_penalty=0.0))
     kept = Smoother(body, registrar, off)(observation, time_s, tracked, size).registration
     assert ((kept.pose[wrong, 3] - truth[wrong, 3]).cos() < 0.9).any()
+
+
+def test_who_walks_backwards_is_seen_by_the_elbows(body):
+    """Forearms to the front: turned to the way they would be bent the wrong way round, which costs more."""
+    time_s, T = times(9), 9
+    directions = RELAXED.clone()
+    directions[[2, 4]] = torch.tensor([0.0, 0.1, -1.0])
+    truth = torch.cat([standing(body, directions, yaw=1.75, x=0.1 * t - 0.4) for t in range(T)])
+    observation = together([see(body, row[None], num=150) for row in truth])
+    registrar, size = Registrar(body), body.default_size(1)
+    tracked = registrar(observation, truth, size)
+    way = walking_yaw(time_s, tracked.pose[:, :3])
+    assert ((way - truth[:, 3]).cos() < -0.9).all()
+    found = Smoother(body, registrar)(observation, time_s, tracked, size).registration
+    assert ((found.pose[:, 3] - truth[:, 3]).cos() > 0.9).all()

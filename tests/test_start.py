@@ -97,6 +97,26 @@ def test_a_limb_that_is_elsewhere_is_found_by_a_refresh(body, starter, changes):
     assert found.score < stuck.score + 1
 
 
+@pytest.mark.parametrize("cold", [True, False])
+def test_the_last_fits_begin_as_near_as_the_starts_are(body, starter, monkeypatch, cold):
+    """From a cold start as any registration does; a refresh does not unsettle what is all but right."""
+    seen, size, begun = see(body, standing(body), num=100), body.default_size(1), []
+    fit = starter.registrar.forward
+
+    def remembered(observation, start, size, prior, rounds, sigma_first, covariance):
+        begun.append((rounds, sigma_first))
+        return fit(observation, start, size, prior, rounds, sigma_first, covariance)
+
+    monkeypatch.setattr(starter.registrar, "forward", remembered)
+    if cold:
+        monkeypatch.setattr(starter, "config", replace(starter.config, refreshes=0))
+        starter(seen.observation(), seen.no_face(), size)
+    else:
+        starter.refresh(seen.observation(), standing(body), size)
+    rounds = starter.config.final_rounds
+    assert begun == [(rounds, None if cold else starter.config.refresh_sigma)]
+
+
 def test_frames_refreshed_together_have_the_answers_of_each_alone(body, starter):
     """Of different points, silhouettes, sizes and priors."""
     poses = [standing(body, limbs(body, **WAVE), x=-0.4), standing(body, x=0.4, yaw=0.4)]
