@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchpose.eyes import Eyes, EyesConfig
+from torchpose.eyes import Eyes, EyesConfig, Stopwatch
 from torchpose.recording import Backgrounds, Frame
 from torchpose.vision.camera import StereoCamera
 
@@ -208,3 +208,28 @@ def test_feet_may_be_where_the_floor_is_as_near_and_nobody_is_below_it(generator
     room = eyes.standing_room(sight, covered)[0]
     assert bool(room[:40, :20].all())
     assert not bool(room[down > 1.25].any())
+
+
+def test_time_counts_for_the_stage_that_spent_it_alone(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr("torchpose.eyes.time.process_time", lambda: now[0])
+    stopwatch = Stopwatch()
+
+    def spend(stage: str, seconds: float, *within: tuple[str, float], fails: bool = False) -> None:
+        with stopwatch.measure(stage):
+            for inner in within:
+                spend(*inner, fails=fails)
+            now[0] += seconds
+            if fails:
+                raise ValueError("broken")
+
+    spend("registration", 1.0, ("size", 2.0), ("faces", 4.0))
+    spend("registration", 8.0)
+    with pytest.raises(ValueError, match="broken"):
+        spend("faces", 64.0, ("size", 16.0), fails=True)
+    spend("faces", 32.0)
+    assert dict(stopwatch.seconds) == {
+        "registration": 9.0,
+        "size": 18.0,
+        "faces": 36.0,
+    }  # the 64 s were never spent

@@ -136,16 +136,22 @@ class LastSight:
 
 
 class Stopwatch:
-    """Processor time by stage, s."""
+    """Processor time by stage, s. What a stage measures within another is its own, not the other's."""
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
+        self._within = [0.0]  # s, of the stages within each that is under way
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
         begin = time.process_time()
-        yield
-        self.seconds[stage] += time.process_time() - begin
+        self._within.append(0.0)
+        try:
+            yield
+        finally:
+            spent = time.process_time() - begin
+            self.seconds[stage] += spent - self._within.pop()
+            self._within[-1] += spent
 
 
 class Eyes(nn.Module):

@@ -219,7 +219,8 @@ class StereoToPose(nn.Module):
         if self.config.size.rounds == 0:
             return self.size
         registrar, together = self.tracker.registrar, stack_observations(observations)
-        return fit_size(registrar, together, pose, self.size, self.config.size)[0]
+        with self.stopwatch.measure("size"):
+            return fit_size(registrar, together, pose, self.size, self.config.size)[0]
 
     def learn_colours(self, sight: Sight, found: Registration) -> None:
         """Let a frame's fit teach which colours the parts have."""
