@@ -288,8 +288,8 @@ def _rim(posed: PosedBody) -> _Rim:
     short = first * turn.cos() + second * turn.sin()
     long = second * turn.cos() - first * turn.sin()
     axes = torch.stack([short, long], -1)
-    length = axes.norm(dim=-2)
-    return _Rim(camera / square * extent, axes / length[..., None, :], (1 - 1 / square).sqrt() * length)
+    length = _length(axes.mT).mT  # (B, K, 1, 2)
+    return _Rim(camera / square * extent, axes / length, (1 - 1 / square).sqrt() * length[..., 0, :])
 
 
 def _shapes(posed: PosedBody, visible: bool) -> Float[Tensor, "batch parts numbers"]:
