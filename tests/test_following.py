@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.following import joint_sd, row, share, status_right
+from benchmarks.following import cost_figures, joint_sd, row, share, status_right
 from benchmarks.identity import TruePerson, followers, meeting, read_people, score, tracked_joints
 from benchmarks.leaving import EMPTY, turn_around
 from torchpose.body.model import BodyModel
@@ -190,6 +190,28 @@ def test_joint_deviations_are_those_of_the_linear_map():
         (0.02**2 + (0.01 * arm[:, 2]) ** 2, 0 * arm[:, 0], (0.01 * arm[:, 0]) ** 2), 1
     ).sqrt()
     torch.testing.assert_close(sd, expected, rtol=0.2, atol=3e-4)
+
+
+def test_two_peoples_cost_is_that_of_the_least_disturbed_runs():
+    # Two people, the first alone, the second alone; the second turn is disturbed but for the second alone.
+    turns = [
+        [
+            {"registration": 150.0, "stereo": 60.0, "export": 900.0},
+            {"registration": 90.0, "stereo": 50.0, "export": 100.0},
+            {"registration": 130.0, "stereo": 70.0},
+        ],
+        [
+            {"registration": 250.0, "stereo": 20.0},
+            {"registration": 140.0, "stereo": 51.0},
+            {"registration": 110.0, "stereo": 50.0},
+        ],
+    ]
+    found = cost_figures(turns)
+    assert (found["registration_two_ms"], found["registration_one_ms"]) == (150.0, 100.0)
+    assert (found["all_two_ms"], found["all_one_ms"]) == (210.0, 150.0)
+    assert found["registration"] == pytest.approx(1.5)
+    assert found["all"] == pytest.approx(1.4)
+    assert math.isnan(cost_figures([[{"stereo": 1.0}] * 3])["registration"])  # nobody was found
 
 
 def test_a_line_of_the_table_counts_identities_and_leaves_out_what_is_unknown():
