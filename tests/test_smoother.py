@@ -210,7 +210,11 @@ def test_a_limb_of_which_only_the_top_shows_turns_by_more_than_one_that_shows_in
         each = []
         for offset in (0.0, 0.03):
             config = SmoothingConfig(
-                offset_sd=offset, slide_sd=0.0, piece=1.0, hypotheses=HypothesisConfig(sweeps=0)
+                rest_time=2.0,  # longer than the frames: rest hardly holds the limbs
+                offset_sd=offset,
+                slide_sd=0.0,
+                piece=1.0,
+                hypotheses=HypothesisConfig(sweeps=0),
             )
             smooth = Smoother(body, registrar, config)(seen, times(2), found, body.default_size(1))
             each.append(smooth.registration.covariance[0].diagonal())
@@ -418,7 +422,8 @@ def test_a_frame_without_points_has_its_neighbours_pose_and_greater_doubt(body, 
     mask[2:4] = False
     blind = replace(observation, cloud=replace(observation.cloud, mask=mask))
     # One place for each limb: several add what a bridge between two frames does not know.
-    alone = SmoothingConfig(hypotheses=HypothesisConfig(sweeps=0), offset_sd=0.0, slide_sd=0.0)
+    nowhere = HypothesisConfig(sweeps=0)
+    alone = SmoothingConfig(rest_time=2.0, hypotheses=nowhere, offset_sd=0.0, slide_sd=0.0)
     smoother = Smoother(body, registrar, alone)
     size = body.default_size(1)
     seen = smoother(observation, times(6), found, size).registration
@@ -479,6 +484,36 @@ def test_one_frame_alone_keeps_its_pose(body, scene):
         for x in (torch.linalg.inv(smooth.filtered), smooth.registration.covariance)
     ]
     assert_close(*sds, rtol=0.1, atol=0)
+
+
+@pytest.mark.parametrize("rest_time", [0.5, 2.0])
+def test_an_unseen_limb_comes_to_rest_as_drift_and_rest_say(body, scene, rest_time):
+    """Against the continuous process: x'' = x / l^2, and the variance that drift and pull balance, drift^2 l / 2."""
+    pose, observation, _, found = scene
+    drift, rest_sd, dt, T = 0.7, 0.4, 0.04, 141
+    long = rest_sd * rest_time**0.5 / drift
+    registrar = Registrar(body, RegistrationConfig(rim=RimConfig(weight=0.0), rest_sd=rest_sd))
+    cloud = replace(observation.cloud, mask=torch.zeros_like(observation.cloud.mask))
+    every = torch.zeros(T, dtype=torch.long)
+    blind = replace(observation, cloud=cloud).share(every)
+    begin = torch.cat([pose[0, :6], body.rest])
+    bent = begin.clone()
+    joint = body.parameter_names.index("forearm_left_2")
+    bent[joint] += 0.2
+    config = SmoothingConfig(joint_drift=drift, rest_time=rest_time, hypotheses=HypothesisConfig(sweeps=0))
+    smooth = Smoother(body, registrar, config)(
+        blind,
+        dt * torch.arange(1, T + 1, dtype=torch.float64),
+        replace(found.take(every), pose=begin.expand(T, -1)),
+        body.default_size(1),
+        Message(0.0, bent, 1e8 * torch.eye(24).to(bent)),
+    ).registration
+    seconds = dt * torch.arange(1, T + 1, dtype=torch.float64)
+    gone = seconds < 3 * long
+    expected = (0.2 * (-seconds / long).exp()).to(begin)
+    assert_close((smooth.pose[:, joint] - begin[joint])[gone], expected[gone], rtol=0.02, atol=0.002)
+    last = smooth.covariance[T // 2 : T // 2 + 10, joint, joint]
+    assert_close(last, torch.full_like(last, drift**2 * long / 2), rtol=0.02, atol=0)
 
 
 def test_a_message_holds_the_first_frame_and_survives_its_state(body, scene):
