@@ -24,7 +24,7 @@ hidden    somebody behind a counter, seen from the waist up: error of elbows and
           legs are hidden, `joints` the share of hidden joints' coordinates whose truth is within two of our standard
           deviations (by draws from the pose's covariance), `angles` the same of the anatomical angles of hidden legs,
           by `poses.csv`. A joint is hidden where the person is not seen at its pixel.
-hidden_stereo  one of these rendered in stereo, end to end.
+hidden_stereo  `HIDDEN_STEREO` of these rendered in stereo, end to end.
 
 Each recording is run by `infer.py`'s own function into a folder of its own, and poses.csv, poses_2.csv, ... are read
 back; who has no file was never found. Settings are those of infer.py.
@@ -87,6 +87,7 @@ LEGS = [JOINT_NAMES.index(f"{joint}_{side}") for joint in ("knee", "ankle") for 
 UPPER = [0, 1, 4, 5]
 DRAWS = 256
 TURNS = 3
+HIDDEN_STEREO = 3
 
 
 @dataclass(frozen=True)
@@ -324,7 +325,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         "cost": [partial(cost, 0, config)],
         "cost_stereo": [partial(cost, 0, config, stereo=True)],
         "hidden": [partial(hide, seed, config) for seed in range(math.ceil(seeds / 4))],
-        "hidden_stereo": [partial(hide, 0, config, stereo=True)],
+        "hidden_stereo": [
+            partial(hide, seed, config, stereo=True) for seed in range(min(HIDDEN_STEREO, seeds))
+        ],
     }
     chosen = [name for name in measures if not arguments.only or arguments.only in name]
     if arguments.only in measures:  # the others' names may contain it

@@ -82,7 +82,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         *("export", "trajectory_filter", "level", "resampling"),
         *("opensim", "bvh", "c3d_file", "motion_export"),
         *("figures", "timeline", "journal", "report", "rerun_log", "activities"),
-        *("eyes", "pipeline", "window", "people", "parts", "overlay", "picture", "session"),
+        *("eyes", "pipeline", "window", "follower", "people", "parts", "overlay", "picture", "session"),
         *("feed", "web_view", "live", "clips", "study", "cli"),
     ),
 }

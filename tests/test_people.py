@@ -9,7 +9,8 @@ from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
 from torchpose.eyes import Sight, View
-from torchpose.people import Follower, People, PeopleConfig, _at_border
+from torchpose.follower import Follower
+from torchpose.people import People, PeopleConfig, _at_border
 from torchpose.pipeline import RIM, StereoToPose
 from torchpose.tracking.location import sighting
 from torchpose.vision.camera import StereoCamera

@@ -17,26 +17,19 @@ from torch.nn.functional import max_pool2d
 from torchpose.body.model import PosedBody
 from torchpose.export import JOINT_NAMES
 from torchpose.eyes import Sight, View
+from torchpose.follower import Follower
 from torchpose.pipeline import FramePose, StereoToPose
 from torchpose.recording import Frame, Recording, UnreadableFrame
-from torchpose.registration.vem import Observation, Registration
+from torchpose.registration.vem import Registration
 from torchpose.registration.walk import yaw_of_way
 from torchpose.tracking.kalman import Gaussian
-from torchpose.tracking.location import (
-    Location,
-    LocationConfig,
-    LocationFilter,
-    Sighting,
-    nowhere,
-    sighting,
-)
+from torchpose.tracking.location import LocationConfig, LocationFilter, Sighting, nowhere, sighting
 from torchpose.tracking.partition import PartitionConfig, split_people
 from torchpose.tracking.tracker import Sought, TrackStatus, track_together
 from torchpose.vision.clump import ArtefactConfig, keep_points, person_points
 from torchpose.vision.colour_histogram import back_projection, colour_histogram, colour_similarity
 from torchpose.vision.faces import FaceMemory
 from torchpose.vision.head import HeadConfig, find_head
-from torchpose.vision.skin import SkinModel
 from torchpose.vision.trunk import TrunkConfig, find_trunk
 from torchpose.window import PeopleWindows
 
@@ -96,56 +89,6 @@ class PeopleConfig:
             raise ValueError(
                 f"hidden_parts and arrival must be at least 1, got {self.hidden_parts} and {self.arrival}"
             )
-
-
-class Follower:
-    """One person: a model of the person's own, and what is known beside the pose."""
-
-    def __init__(self, model: StereoToPose, sized: bool):
-        self.model = model
-        self.location: Location = nowhere(model.size.new_zeros(1, 3))
-        self.clothes: Tensor | None = None  # (1, bins), a running mean
-        self.face: FaceMemory | None = None
-        self.face_time = -math.inf  # s
-        self.seen = 0  # frames with points
-        self.known = False  # whether this person was ever there
-        self.sized = sized
-        # s, and m to the right and away, of the trunk in the last of a walk's span
-        self.trail: Float[Tensor, "places 3"] = torch.zeros(0, 3, dtype=torch.float64)
-        self.heights: list[float] = []  # m, in frames that show all of the person
-        self.samples: list[tuple[float, Observation, Registration]] = []  # for the size
-
-    def state(self) -> dict[str, Tensor]:
-        """What the next frame starts from, as tensors."""
-        numbers = torch.tensor([self.seen, self.known, self.sized, self.face_time], dtype=torch.float64)
-        state = self.model.state() | {"follower": numbers}
-        state |= {"trail": self.trail, "heights": torch.tensor(self.heights, dtype=torch.float64)}
-        state |= {f"location_{name}": value for name, value in self.location.state().items()}
-        if self.clothes is not None:
-            state["clothes"] = self.clothes
-        if self.face is not None:
-            state |= {"face": self.face.box}
-            state |= {f"skin_{name}": value for name, value in vars(self.face.skin).items()}
-        return {name: value.clone() for name, value in state.items()}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from a `state`; samples for the size are gathered anew."""
-        like = self.model.size
-        self.model.restore(state)
-        seen, known, sized, self.face_time = state["follower"].tolist()
-        self.seen, self.known, self.sized = int(seen), bool(known), bool(sized)
-        where = {
-            name.removeprefix("location_"): value.to(like.device)
-            for name, value in state.items()
-            if name.startswith("location_")
-        }
-        self.location = Location.restore(where)
-        self.trail, self.heights = state["trail"], state["heights"].tolist()
-        self.clothes = state["clothes"].to(like) if "clothes" in state else None
-        self.face = None
-        if "face" in state:
-            skin = {name[5:]: value.to(like) for name, value in state.items() if name.startswith("skin_")}
-            self.face = FaceMemory(state["face"].to(like), SkinModel(**skin))
 
 
 class People:
