@@ -19,6 +19,7 @@ from torchpose.body.angle import ANATOMICAL_NAMES
 from torchpose.body.model import BodyModel
 from torchpose.export import JOINT_NAMES, STATUSES
 from torchpose.report import Report, _floor, _lowest, _Series, add_activities
+from torchpose.vision.floor import Floor
 
 
 @pytest.fixture(scope="module")
@@ -188,6 +189,22 @@ def test_the_grid_lies_under_the_feet(body: BodyModel):
     one.lowest = [[0.0, 0.9, 3.0]] * 50
     assert _floor([one]) == pytest.approx([0.9, 0, 0])
     assert _floor([_Series(0, body, body.default_size(1))]) is None
+
+
+def test_the_grid_lies_on_the_floor_that_was_found(tmp_path: Path, body: BodyModel):
+    """A camera 1.2 m over the floor that leans and looks down: three of the grid's points are at no height."""
+    normal = torch.nn.functional.normalize(torch.tensor([0.1, -1.0, -0.3]), dim=0)
+    summary = {**SUMMARY, "floor": {"normal": normal.tolist(), "height_m": 1.2, "tilt_deg": 17.0}}
+    make_report(body, make_poses(body, 2)).write(tmp_path / "report.html", summary)
+    _, data = read_page(tmp_path / "report.html")
+    assert data["floor_seen"]
+    a, b, c = data["floor"]
+    grid = torch.tensor([[x, a + b * x + c * z, z] for x, z in ((0.0, 0.0), (2.0, 1.0), (-1.0, 4.0))])
+    assert_close(Floor(normal, torch.tensor(1.2)).above(grid), torch.zeros(3), atol=1e-6, rtol=0)
+    make_report(body, make_poses(body, 2)).write(tmp_path / "report.html", {**SUMMARY, "floor": None})
+    _, data = read_page(tmp_path / "report.html")
+    assert not data["floor_seen"]
+    assert data["floor"] is not None  # under the feet
 
 
 def test_the_lowest_place_is_on_the_lowest_ellipsoid(body: BodyModel):

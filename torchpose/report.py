@@ -140,7 +140,8 @@ class Report:
             "people": [
                 one.packed() | self._packed_points(person, images) for person, one in enumerate(self._people)
             ],
-            "floor": _floor(self._people),
+            "floor": _plane(summary.get("floor")) or _floor(self._people),
+            "floor_seen": bool(summary.get("floor")),
             "missing": int(_MISSING),
             "panels": panels,
             "worst_sd": math.degrees(WORST_SD),
@@ -266,8 +267,16 @@ def _lowest(posed: PosedBody) -> Float[Tensor, "batch 3"]:
     return torch.stack([x, y, z], -1)
 
 
+def _plane(floor: Mapping[str, Any] | None) -> list[float] | None:
+    """A summary's floor as `_floor` gives one."""
+    if floor is None:
+        return None
+    x, y, z = floor["normal"]
+    return [-floor["height_m"] / y, -x / y, -z / y]
+
+
 def _floor(people: Sequence[_Series]) -> list[float] | None:
-    """Where the floor should be drawn, [a, b, c] of y = a + b x + c z in m; None without a pose.
+    """Where a floor that was not seen should be drawn, [a, b, c] of y = a + b x + c z in m; None without a pose.
 
     The plane under the feet. How it slopes, because the camera looks down, shows only where feet have moved.
     """

@@ -340,7 +340,7 @@
       element("image-caption").textContent = `Frame ${frame[shown[near]]}` + (exact ? "" : `, the nearest of ${shown.length} with a picture`) + " · outlines and points by part, skeleton left orange, right blue";
       const posed = styles[who.status[cursor]].posed;
       const hint = exact ? "drag turns, wheel zooms, shift-drag moves" : "points only with a picture's own frame";
-      element("scene-caption").textContent = posed ? `Grid 0.5 m, laid under the feet · ${hint}` : `No pose of ${nameOf(person)} in this frame`;
+      element("scene-caption").textContent = posed ? `Grid 0.5 m, ${data.floor_seen ? "on the floor" : "laid under the feet"} · ${hint}` : `No pose of ${nameOf(person)} in this frame`;
     }
     for (const panel of panels) {
       const inside = time[cursor] >= span[0] && time[cursor] <= span[1];
@@ -470,7 +470,7 @@
       line("Click or drag on a plot or on the time line: pictures, 3-D view and plots go to that moment. Numbers are degrees ± two standard deviations."),
       line(key("←"), " ", key("→"), " frame (with shift: 10), ", key("Home"), " ", key("End"), " ends, ", key("Page ↑"), " ", key("Page ↓"), " picture, ", key("space"), " plays."),
       line(key("+"), " ", key("−"), " ", key("0"), " zoom time, also ctrl-wheel on a plot. ", key("A"), " ", key("D"), " ", key("W"), " ", key("S"), " turn the 3-D view, ", key("Q"), " ", key("E"), " zoom it, ", key("R"), " resets it."),
-      line("3-D axes as in poses.csv: x to the camera's right, y down, z away from it. The grid is laid under the feet, as far as they have moved."),
+      line("3-D axes as in poses.csv: x to the camera's right, y down, z away from it. " + (data.floor_seen ? "The grid lies on the floor that was found in the empty scene: feet off it are poses' errors, or its own." : "No floor was found: the grid is laid under the feet, as far as they have moved.")),
       line("The white part of the skeleton is the trunk. Frames without a pose are hatched: nothing is filled in.")));
     element("about").append(make("div", { class: "wide" }, make("details", {}, make("summary", {}, "Settings"), table(flat(summary.settings || {})))));
   }
