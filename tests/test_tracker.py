@@ -256,6 +256,39 @@ def test_points_that_stay_without_a_part_are_sought_for_once(scripted, step):
         assert starter.calls.count("refresh") == searches, stray
 
 
+def test_where_many_points_stray_after_the_limbs_were_sought_all_of_the_body_is(scripted, step, body):
+    """Taken where it fits better; what strays on (a bag) is no reason for more, but half as much again is."""
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    registrar.stray = 0.9 * CONFIG.doubt
+    step(tracker, 1.0)
+    assert starter.calls == ["cold", "refresh"]
+    registrar.stray, starter.misfit = 1.1 * CONFIG.doubt, 2 * GOOD
+    assert step(tracker, 2.0).status is TrackStatus.tracked
+    assert starter.calls == ["cold", "refresh", "refresh", "cold"]
+    again = Tracker(body, CONFIG, registrar, starter)
+    again.restore(tracker.state())
+    for one in (tracker, again):
+        starter.calls.clear()
+        for time_s, stray, colds in (
+            (3.0, 1.5, 0),
+            (4.0, 1.8, 1),
+            (4.1, 3.0, 1),
+            (5.0, 3.0, 2),
+            (6.0, 0.1, 2),
+        ):
+            registrar.stray = stray * CONFIG.doubt
+            assert step(one, time_s).status is TrackStatus.tracked
+            assert starter.calls.count("cold") == colds, (time_s, stray)
+    starter.pose, starter.misfit = standing(body, x=0.5), GOOD / 2
+    registrar.stray = 1.1 * CONFIG.doubt
+    frame = step(tracker, 7.0)
+    assert frame.status is TrackStatus.recovered
+    assert_close(frame.registration.pose, starter.pose)
+    step(tracker, 7.1)
+    assert_close(registrar.starts, starter.pose.expand(2, -1))  # the jump is no velocity
+
+
 def test_a_fit_that_is_not_acceptable_has_the_limbs_sought_before_a_cold_start(scripted, step, body):
     tracker, registrar, starter = scripted
     step(tracker, 0.0)
@@ -432,6 +465,7 @@ def test_limbs_that_are_sought_soon_anyway_are_sought_with_somebody_elses(body, 
         ({"search_slack": -1.0}, "search_slack must be positive, got -1.0"),
         ({"accept_misfit": -1.0}, "accept_misfit must be positive, got -1.0"),
         ({"aside": 0.0}, "aside must be positive, got 0.0"),
+        ({"doubt": 0.0}, "doubt must be positive, got 0.0"),
         ({"profile": 1.5}, "profile must be a sine between 0 and 1, got 1.5"),
     ],
 )

@@ -45,6 +45,9 @@ class TrackingConfig:
     accept_misfit: float = 0.060  # m: a pose that fits worse is none
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
+    doubt: float = (
+        0.15  # of the points straying once limbs were sought, from which the whole body is sought, too
+    )
     retry: float = 0.25  # s after a search that found nothing better, before the next one
     against: float = 1.75  # rad off the way somebody walks, from which the other way round is tried, too
     aside: float = 0.35  # rad off that way, from which a start faces it
@@ -66,6 +69,7 @@ class TrackingConfig:
             "accept_misfit",
             "stray_distance",
             "stray_share",
+            "doubt",
             "retry",
             "look_around",
             "search_slack",
@@ -112,6 +116,7 @@ class Tracker(nn.Module):
         self._velocity: Tensor | None = None  # per second
         self._time = 0.0
         self._known_stray = 0.0
+        self._kept_stray = 0.0  # once all of the body was sought in vain
         self._looked = -math.inf  # when limbs were last sought elsewhere, s
         self._failed = -math.inf  # when a search last found nothing, s
         self._turned = -math.inf  # when it was last tried the other way round, s
@@ -125,7 +130,8 @@ class Tracker(nn.Module):
         memory |= {} if self._changed == -math.inf else {"changed": self._changed}
         if self._pose is not None:
             poses["pose"] = self._pose
-            memory |= {"time": self._time, "known_stray": self._known_stray, "looked": self._looked}
+            memory |= {"time": self._time, "looked": self._looked}
+            memory |= {"known_stray": self._known_stray, "kept_stray": self._kept_stray}
         if self._velocity is not None:
             poses["velocity"] = self._velocity
         return poses | {name: torch.tensor(value, dtype=torch.float64) for name, value in memory.items()}
@@ -143,6 +149,7 @@ class Tracker(nn.Module):
             self._pose, self._time = state["pose"].to(self.body.axes), float(state["time"])
             self._velocity = state["velocity"].to(self.body.axes) if "velocity" in state else None
             self._known_stray, self._looked = float(state["known_stray"]), float(state["looked"])
+            self._kept_stray = float(state["kept_stray"])
 
     def begin(self, pose: Float[Tensor, "1 parameters"], time_s: float) -> None:
         """Take a known pose as the last one: the next frame follows it instead of searching."""
@@ -257,7 +264,7 @@ class Tracker(nn.Module):
 
     def end_frame(self, person: "Sought", found: Registration, other: Registration | None) -> TrackedFrame:
         """The answer, from a registration, and from the `other` one if limbs were sought: where a limb moved too fast
-        to follow, it is elsewhere. All of the body is sought if both fail."""
+        to follow, it is elsewhere. All of the body is sought if both fail, or many points stray."""
         assert person.observation is not None
         assert person.faces is not None
         status = TrackStatus.partial if person.cut else TrackStatus.tracked
@@ -267,12 +274,15 @@ class Tracker(nn.Module):
                 found = other
             self._known_stray = self._stray(found)
         face = bool(person.faces.found[0])
-        if person.walking is not None and not face and self._against(found, person.walking, person.time_s):
+        against = person.walking is not None and not face and self._against(found, person.walking)
+        doubtful = other is not None and self._doubtful(found)
+        if (against or doubtful) and person.time_s - self._turned >= self.config.retry:
             anew = self.starter(person.observation, person.faces, person.size, person.walking)
             scores = [float(self.starter.score(one, person.walking)) for one in (found, anew)]
             if self.acceptable(anew) and scores[1] < scores[0]:
                 found, status = anew, TrackStatus.recovered
                 self.forget()
+            self._kept_stray = self._stray(found)
             self._turned = person.time_s
         # Without colours the way that the person faces is given at the start, not measured: who does not walk away
         # turns away unseen. Whose face is seen does not turn away either.
@@ -288,10 +298,18 @@ class Tracker(nn.Module):
         self._remember(found, person.time_s)
         return TrackedFrame(status, found)
 
-    def _against(self, found: Registration, walking: float, time_s: float) -> bool:
-        """Whether a pose goes backwards, which has not been doubted of late."""
-        off = math.remainder(float(found.pose[0, 3]) - walking, 2 * math.pi)
-        return abs(off) > self.config.against and time_s - self._turned >= self.config.retry
+    def _against(self, found: Registration, walking: float) -> bool:
+        """Whether a pose goes backwards."""
+        return abs(math.remainder(float(found.pose[0, 3]) - walking, 2 * math.pi)) > self.config.against
+
+    def _doubtful(self, found: Registration) -> bool:
+        """Whether so many points stray although limbs were sought that trunk or head must be wrong, too.
+
+        As with limbs, what strayed after the last search of all of the body (a bag, a skirt) is no reason for another.
+        """
+        stray = self._stray(found)
+        self._kept_stray = min(self._kept_stray, stray)
+        return stray > max(self.config.doubt, 1.5 * self._kept_stray)
 
     def _stray(self, found: Registration) -> float:
         """Share of the points that are believed to be of no part."""
