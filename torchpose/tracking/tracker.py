@@ -45,9 +45,7 @@ class TrackingConfig:
     accept_misfit: float = 0.060  # m: a pose that fits worse is none
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
-    doubt: float = (
-        0.15  # of the points straying once limbs were sought, from which the whole body is sought, too
-    )
+    doubt: float = 0.15  # of the points straying after that, from which all of the body is sought
     retry: float = 0.25  # s after a search that found nothing better, before the next one
     against: float = 1.75  # rad off the way somebody walks, from which the other way round is tried, too
     aside: float = 0.35  # rad off that way, from which a start faces it
@@ -116,10 +114,10 @@ class Tracker(nn.Module):
         self._velocity: Tensor | None = None  # per second
         self._time = 0.0
         self._known_stray = 0.0
-        self._kept_stray = 0.0  # once all of the body was sought in vain
+        self._kept_stray = 0.0  # when all of the body was last sought
         self._looked = -math.inf  # when limbs were last sought elsewhere, s
         self._failed = -math.inf  # when a search last found nothing, s
-        self._turned = -math.inf  # when it was last tried the other way round, s
+        self._turned = -math.inf  # when all of the body was last sought out of doubt, s
         self._changed = -math.inf  # when it last started from a changed pose, s
 
     def state(self) -> dict[str, Tensor]:
