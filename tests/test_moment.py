@@ -174,6 +174,7 @@ def test_loss_and_gradient_with_prior_and_limits_are_those_of_the_residuals(kind
     loss, gradient, normal = equations(pose)
     residual = pose_residual(body, size, rows, prior, config)
     assert_close(loss, 0.5 * (residual(pose) ** 2).sum(1), atol=0, rtol=1e-11)
+    assert_close(equations.loss(pose, body(pose, size)), loss, atol=0, rtol=1e-11)
     step = 1e-6 * torch.eye(24, dtype=pose.dtype)
     slope = torch.stack([(residual(pose + d) ** 2 - residual(pose - d) ** 2).sum(1) / 4e-6 for d in step], -1)
     assert_close(gradient, slope, atol=1e-7 * float(slope.abs().max()), rtol=0)
@@ -207,9 +208,9 @@ def test_a_loss_of_nothing_is_not_negative_in_single_precision():
     start = truth + 0.2 * torch.randn_like(truth)
     silent = PosePrior(truth, torch.zeros_like(truth))
     equations = equations_by_moments(body, size, rows, silent, FittingConfig(limit_sd=0.0), body(start, size))
-    loss = equations(truth)[0]
-    assert (loss >= 0).all()
-    assert (loss < 1e-5 * equations(start)[0]).all()
+    for loss in (equations(truth)[0], equations.loss(truth, body(truth, size))):
+        assert (loss >= 0).all()
+        assert (loss < 1e-5 * equations(start)[0]).all()
 
 
 def test_a_batch_in_chunks_equals_one_by_one(monkeypatch):

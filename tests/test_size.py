@@ -5,9 +5,19 @@ from pathlib import Path
 import pytest
 import torch
 from synthetic_cloud import RELAXED, see, standing
+from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
-from torchpose.registration.size import SizeConfig, fit_size, read_size, stack_observations, write_size
+from torchpose.registration.fitting import PosePrior
+from torchpose.registration.size import (
+    JointProblem,
+    SizeConfig,
+    fit_size,
+    read_size,
+    size_precision,
+    stack_observations,
+    write_size,
+)
 from torchpose.registration.vem import Registrar
 
 BODY = BodyModel()
@@ -70,3 +80,21 @@ def test_a_file_that_is_not_a_person_is_told(tmp_path: Path, text: str | None, m
         (tmp_path / "person.yaml").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_size(tmp_path / "person.yaml", BODY)
+
+
+def test_residuals_alone_are_those_with_the_jacobian():
+    torch.manual_seed(1)
+    pose, size = torch.cat([standing(BODY, RELAXED), standing(BODY, RELAXED, yaw=0.4)]), BODY.default_size(1)
+    observation = stack_observations([see(BODY, one[None], size).observation() for one in pose])
+    registrar, posed = Registrar(BODY), BODY(pose, size)
+    foot = registrar.correspond(posed, observation)
+    labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
+    rows, support = registrar.rows(posed, foot, labelling, observation)
+    prior = registrar.with_rest(PosePrior(pose, torch.ones_like(pose)), support)
+    root = torch.linalg.cholesky(size_precision(BODY, SizeConfig())).mT
+    problem = JointProblem(registrar, rows, prior, posed, size, root)
+    unknowns = torch.cat([pose.flatten(), size[0]])[None]
+    unknowns = unknowns + 0.1 * torch.randn_like(unknowns)
+    residual, _ = problem.linearize(unknowns)
+    assert residual.square().sum() > 100
+    assert_close(problem.residual(unknowns), residual, atol=1e-3, rtol=1e-4)

@@ -23,6 +23,7 @@ Normal = tuple[
     Float[Tensor, "batch unknowns unknowns"],
 ]
 NormalEquations = Callable[[Float[Tensor, "batch unknowns"]], Normal]
+Loss = Callable[[Float[Tensor, "batch unknowns"]], Float[Tensor, " batch"]]
 
 
 class Status(IntEnum):
@@ -53,21 +54,29 @@ class Solution:
 
     value: Float[Tensor, "batch unknowns"]
     loss: Float[Tensor, " batch"]  # half the sum of squares at `value`
-    normal: Float[Tensor, "batch unknowns unknowns"]  # J^T J at `value`, 0 where that is not finite
     status: Int[Tensor, " batch"]
     steps: Int[Tensor, " batch"]  # tried, whether kept or not
 
 
 def levenberg_marquardt(
-    linearize: Linearize, start: Float[Tensor, "batch unknowns"], config: LMConfig = LMConfig()
+    linearize: Linearize,
+    start: Float[Tensor, "batch unknowns"],
+    config: LMConfig = LMConfig(),
+    residual: Residual | None = None,
 ) -> Solution:
     """Minimise |r(x)|^2 / 2 for each row of `start` on its own: `minimize` for residuals with a Jacobian.
 
     Args:
         linearize: maps x (B, P) to residuals r (B, M) and their Jacobian (B, M, P).
         start: first guess, a problem a row.
+        residual: r alone, if it takes less time.
     """
-    return minimize(normal_equations(linearize), start, config)
+
+    def loss(x: Tensor) -> Tensor:
+        assert residual is not None
+        return 0.5 * residual(x).square().sum(1)
+
+    return minimize(normal_equations(linearize), start, config, loss=None if residual is None else loss)
 
 
 def minimize(
@@ -75,6 +84,7 @@ def minimize(
     start: Float[Tensor, "batch unknowns"],
     config: LMConfig = LMConfig(),
     first: Normal | None = None,
+    loss: Loss | None = None,
 ) -> Solution:
     """Minimise a sum of squares for each row of `start` on its own, by Levenberg and Marquardt's method.
 
@@ -86,39 +96,46 @@ def minimize(
         equations: maps x (B, P) to the loss |r|^2 / 2 (B,), J^T r (B, P) and J^T J (B, P, P).
         start: first guess, a problem a row.
         first: the equations at `start`, if they are at hand.
+        loss: the loss alone, if it takes less time: of the last step's end nothing else is asked.
     """
     x = start
-    loss, gradient, normal = equations(x) if first is None else first
+    least, gradient, normal = equations(x) if first is None else first
     # A column of J that is not finite shows on the diagonal of J^T J.
-    finite = loss.isfinite() & gradient.isfinite().all(1) & _diagonal(normal).isfinite().all(1)
+    finite = least.isfinite() & gradient.isfinite().all(1) & _diagonal(normal).isfinite().all(1)
     active = finite
     status = torch.where(finite, int(Status.MAX_STEPS), int(Status.NON_FINITE))
     steps = torch.zeros_like(status)
-    damping = torch.full_like(loss, config.damping)
+    damping = torch.full_like(least, config.damping)
     normal = torch.where(finite[:, None, None], normal, 0.0)
     for i in range(config.max_steps):
+        last = i + 1 == config.max_steps
         step, solved = _solve(normal, gradient, damping)
         trial = torch.where(active[:, None], x + step, x)
-        trial_loss, trial_gradient, trial_normal = equations(trial)
-        # False where the trial is not finite. A Jacobian that is not would leave no way on: its diagonal
-        # tells.
-        better = active & (trial_loss < loss) & (_diagonal(trial_normal).amax(1) < torch.inf)
+        further = None
+        if last and loss is not None:
+            trial_loss = loss(trial)
+        else:
+            trial_loss, *further = equations(trial)
+        # False where the trial is not finite.
+        better = active & (trial_loss < least)
+        if further is not None:  # a Jacobian that is not would leave no way on: its diagonal tells
+            better &= _diagonal(further[1]).amax(1) < torch.inf
         small = step.abs().amax(1) < config.step_tolerance
-        slow = loss - trial_loss <= config.loss_tolerance * loss
+        slow = least - trial_loss <= config.loss_tolerance * least
         # A rejected step this small means that the loss cannot be resolved any further.
         done = active & torch.where(better, small | slow, solved & small)
         x = torch.where(better[:, None], trial, x)
-        loss = torch.where(better, trial_loss, loss)
-        normal = torch.where(better[:, None, None], trial_normal, normal)
-        gradient = torch.where(better[:, None], trial_gradient, gradient)
-        damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
+        least = torch.where(better, trial_loss, least)
         steps = steps + active
         status = torch.where(done, int(Status.CONVERGED), status)
         active = active & ~done
         # Asking waits for the device: not after the last step.
-        if i + 1 < config.max_steps and not bool(active.any()):
+        if last or further is None or not bool(active.any()):
             break
-    return Solution(x, loss, normal, status, steps)
+        gradient = torch.where(better[:, None], further[0], gradient)
+        normal = torch.where(better[:, None, None], further[1], normal)
+        damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
+    return Solution(x, least, status, steps)
 
 
 def normal_equations(linearize: Linearize) -> NormalEquations:

@@ -188,11 +188,17 @@ def _minimize(
     by_moments = equations_by_moments(body, size, rows, prior, config, posed)
     tried: list[tuple[Tensor, PosedBody]] = []
 
-    def remembered(pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def remembered(pose: Tensor) -> tuple[Tensor, PosedBody]:
         tried.append((pose, body(pose, size)))
-        return by_moments.at(*tried[-1])
+        return tried[-1]
 
-    solution = minimize(remembered, start, config.lm, by_moments.at(start, posed))
+    solution = minimize(
+        lambda pose: by_moments.at(*remembered(pose)),
+        start,
+        config.lm,
+        by_moments.at(start, posed),
+        lambda pose: by_moments.loss(*remembered(pose)),
+    )
     # The answer of a row is its start or one of its trials.
     for pose, there in tried:
         posed = there.where((pose == solution.value).all(1), posed)
@@ -222,6 +228,11 @@ class PoseEquations:
         normal = whole[:, :-1, :-1] + torch.diag_embed((slope * slope).sum(1))
         # Where the sum of squares is 0 its terms still cancel only up to rounding.
         return 0.5 * loss.clamp_min(0), whole[:, :-1, -1] + by_pose, normal
+
+    def loss(self, pose: Float[Tensor, "batch parameters"], posed: PosedBody) -> Float[Tensor, " batch"]:
+        """Half the sum of squares alone, with the body `posed` at this pose."""
+        residual, _ = pose_terms(self.body, pose, self.prior, self.config)
+        return 0.5 * (self.of_rows.loss(posed) + residual.square().sum((1, 2))).clamp_min(0)
 
 
 def equations_by_moments(

@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.ellipsoid import flattened, foot_of_part, rough_distance
+from torchpose.body.ellipsoid import flattened, foot_of_part, rough_square
 from torchpose.body.model import PosedBody
 from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.limb_search import LEAST, LimbSearch
 from torchpose.registration.occlusion import OcclusionConfig, behind, entries
 from torchpose.registration.silhouette import silhouette_residual
 from torchpose.registration.start import picked
-from torchpose.registration.vem import Distance, Observation, Registrar
+from torchpose.registration.vem import Distance, Observation, Registrar, nearest_parts
 
 
 @dataclass(frozen=True)
@@ -70,14 +70,15 @@ class LimbScore(nn.Module):
         config, points = self.registrar.config, observation.cloud.points
         posed = self.body(pose, size)
         pressed = self._pressed(posed, observation)
-        square = rough_distance(pressed, points, config.visible).square()
+        square = rough_square(pressed, points, config.visible)
         F, K = square.shape[:2]
         own = torch.zeros(len(self.parts), K, dtype=torch.bool, device=pose.device).scatter(
             1, self.parts, True
         )
         others = torch.where(own[:, :, None], torch.inf, square[:, None])
         few = min(config.near, K - self.parts.shape[1])
-        rough, near = others.topk(few, 2, largest=False)
+        near = nearest_parts(others, few)
+        rough = others.gather(2, near)
         asked = torch.zeros_like(square, dtype=torch.bool).scatter(1, near.flatten(1, 2), True)
         exact = self._exact(pressed, points, square, asked)
         potential = observation.potential.mT
@@ -126,7 +127,7 @@ class LimbScore(nn.Module):
         at = torch.arange(len(own), device=own.device)[:, None], own  # of a table of all parts the limb's
         near, rough = known.near[frame, limb], known.rough[frame, limb]
         # A part is judged by its exact distance where it is among the nearest of all parts.
-        square = rough_distance(pressed, points, config.visible).square()
+        square = rough_square(pressed, points, config.visible)
         among = _least(torch.cat([rough, square], 1), config.near)
         square = self._exact(pressed, points, square, among[:, few:])
         # All parts in one table: the known ones, the nearest among them exactly, and the limb's own.
@@ -179,7 +180,7 @@ class LimbScore(nn.Module):
         """
         cloud = observation.cloud
         posed = _chosen(self.body(pose, size), self.parts[limb])
-        away = rough_distance(posed, cloud.points, self.registrar.config.visible).amin(1)
+        away = rough_square(posed, cloud.points, self.registrar.config.visible).amin(1)
         away = torch.where(cloud.mask, away, torch.inf)
         half = picked(observation, away.topk(-(-away.shape[1] // 2), 1, largest=False).indices)
         count = (cloud.mask.sum(1, keepdim=True) + 1) // 2

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.ellipsoid import FEW_STEPS, foot_point, rough_distance
+from torchpose.body.ellipsoid import FEW_STEPS, foot_point, rough_square
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.registration.silhouette import silhouette_residual
 from torchpose.registration.vem import Observation, Registrar
@@ -121,7 +121,7 @@ class LimbSearch(nn.Module):
                 foot = foot_point(some, points, registrar.config.visible, FEW_STEPS)
                 square = foot.residual.square().sum(-1)
             else:
-                square = rough_distance(some, points, registrar.config.visible).square()
+                square = rough_square(some, points, registrar.config.visible)
             square = square.unflatten(1, (-1, *parts.shape))  # (B, candidates, L, own parts, N)
             inside = appearance - square / (2 * self.config.sigma**2)
             # By hand: `exp` of what is 0 in single precision takes 20 times as long.

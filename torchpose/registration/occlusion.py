@@ -56,15 +56,19 @@ def entries(
     depth = torch.where(points[..., 2:] > 0, points[..., 2:], 1.0)
     ray = torch.cat([points[..., :2] / depth, torch.ones_like(depth)], -1)
     unit = posed.frames.mT / posed.radii[..., None]  # to the space in which each part is the unit ball
-    camera = -(unit @ posed.centers[..., None])[..., 0]  # (B, K, 3)
-    way = (unit.flatten(1, 2) @ ray.mT).unflatten(
-        1, unit.shape[1:3]
-    )  # (B, K, 3, N): coordinates before points
-    # |camera + s way|^2 = 1
-    a = way.square().sum(2)
-    b = (way * camera[..., None]).sum(2)
-    root = b * b - a * (camera.square().sum(-1, keepdim=True) - 1)
-    enters = (-b - root.clamp_min(0).sqrt()) / a
+    camera = unit @ posed.centers[..., None]  # where it stands there, beside the ball
+    # |s way - camera|^2 = 1 for way = unit ray is a s^2 - 2 b s + c = 0: a, and b^2 - a c, are square forms of the ray,
+    # so one product gives those of all pairs.
+    way, toward = unit.mT @ unit, unit.mT @ camera
+    c = camera.square().sum((2, 3)) - 1
+    across = toward * toward.mT - c[..., None, None] * way
+    x, y, one = ray.mT.unbind(1)
+    squares = torch.stack([x * x, y * y, one, 2 * x * y, 2 * x, 2 * y], 1)  # (B, 6, N)
+    forms = torch.cat([way, across], 1)
+    forms = torch.cat([forms.diagonal(dim1=2, dim2=3), forms[..., [0, 0, 1], [1, 2, 2]]], 2)
+    a, root = (forms @ squares).chunk(2, 1)
+    b = toward[..., 0] @ ray.mT
+    enters = (b - root.clamp_min(0).sqrt()) / a
     return enters, torch.where(root > 0, enters, torch.inf)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpose.atomic import replacing
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.least_squares import LMConfig, levenberg_marquardt, linearize_by_autograd
-from torchpose.registration.fitting import PosePrior, Rows, linearize_by_screws
+from torchpose.registration.fitting import PosePrior, Rows, linearize_by_screws, pose_terms
 from torchpose.registration.vem import Observation, Registrar
 from torchpose.vision.points import PointCloud
 
@@ -84,9 +84,10 @@ def fit_size(
         labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
         rows, support = registrar.rows(posed, foot, labelling, observation)
         prior = registrar.with_rest(nothing, support)
-        problem = _JointProblem(registrar, rows, prior, posed, mean, root)
+        problem = JointProblem(registrar, rows, prior, posed, mean, root)
         start = torch.cat([pose.flatten(), size[0]])[None]
-        solution = levenberg_marquardt(problem.linearize, start, LMConfig(max_steps=config.lm_steps))
+        lm = LMConfig(max_steps=config.lm_steps)
+        solution = levenberg_marquardt(problem.linearize, start, lm, problem.residual)
         pose, size = problem.split(solution.value)
         size = size.clamp(SMALLEST, LARGEST)
     return size, pose
@@ -149,7 +150,7 @@ def size_precision(body: BodyModel, config: SizeConfig) -> Float[Tensor, "sizes 
 
 
 @dataclass(frozen=True)
-class _JointProblem:
+class JointProblem:
     """All frames' poses and the sizes as one least-squares problem: the rows of a frame see its own pose alone."""
 
     registrar: Registrar
@@ -184,6 +185,15 @@ class _JointProblem:
         own = torch.cat([self.root.new_zeros(len(self.root), B * P), self.root], 1)
         prior = (self.root @ (size - self.mean)[0])[None]
         return torch.cat([residual.reshape(1, -1), prior], 1), torch.cat([both, own])[None]
+
+    def residual(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "1 residuals"]:
+        """What `linearize` gives first."""
+        body, fitting = self.registrar.body, self.registrar.config.fitting
+        pose, size = self.split(unknowns)
+        terms, _ = pose_terms(body, pose, self.prior, fitting)
+        frames = torch.cat([self._row_residual(body(pose, size)), terms.flatten(1)], 1)
+        prior = (self.root @ (size - self.mean)[0])[None]
+        return torch.cat([frames.reshape(1, -1), prior], 1)
 
     def _resized(self, posed: PosedBody) -> Rows:
         """The rows with their model points where the ellipsoids' new radii put them."""

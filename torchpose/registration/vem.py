@@ -20,7 +20,7 @@ from torchpose.body.ellipsoid import (
     flattened,
     foot_of_part,
     foot_point,
-    rough_distance,
+    rough_square,
     unflattened,
 )
 from torchpose.body.model import BodyModel, PosedBody
@@ -206,8 +206,16 @@ class Correspondence:
     """The model's points that may answer for each data point, and how far it is from every part."""
 
     part: Int[Tensor, "batch few num"]  # the parts that these points are on
-    foot: FootPoint  # batch, few, num
+    foot: FootPoint  # batch, few, num; of the body `flattened` where `back` is not None
     square: Float[Tensor, "batch parts num"]  # m^2; of other parts than these to first order
+    back: Float[Tensor, "batch parts 3 3"] | None = None  # of `flattened`
+
+    def of(self, posed: PosedBody, points: Float[Tensor, "batch num 3"], index: Tensor | None) -> FootPoint:
+        """Of each point the foot points numbered `index` (B, few, N), None for all, on the parts as they are `posed`."""
+        foot, part = self.foot, self.part
+        if index is not None:
+            foot, part = foot.take(index), part.gather(1, index)
+        return foot if self.back is None else unflattened(foot, posed, part, points, self.back)
 
 
 @dataclass(frozen=True)
@@ -323,13 +331,11 @@ class Registrar(nn.Module):
             square = foot.residual.square().sum(-1)
         else:
             # A point's label is one of the nearest parts; those far off need no foot point to be told apart from these.
-            rough = rough_distance(seen, points, config.visible).square()
-            part = rough.detach().topk(min(config.near, K), 1, largest=False).indices
+            rough = rough_square(seen, points, config.visible)
+            part = nearest_parts(rough.detach(), min(config.near, K))
             foot = foot_of_part(seen, part, points, config.visible)
             square = rough.scatter(1, part, foot.residual.square().sum(-1))
-        return Correspondence(
-            part, foot if back is None else unflattened(foot, posed, part, points, back), square
-        )
+        return Correspondence(part, foot, square, back)
 
     def trust(self, posed: PosedBody, observation: Observation) -> Float[Tensor, "batch parts"]:
         """How much a distance along the ray counts at each part: less where it is noise of more than `ray_sd`."""
@@ -413,18 +419,15 @@ class Registrar(nn.Module):
         In memory the coordinates stand before the pairs, so that every operation runs along the pairs.
         """
         config, cloud = self.config, observation.cloud
-        square = foot.square.gather(1, foot.part)[..., None]
-        feet = torch.cat([foot.foot.local, foot.foot.normal, square], -1).mT  # (B, few, 7, N)
-        if answer.index is not None:
-            feet = feet.gather(1, answer.index[:, :, None].expand(-1, -1, 7, -1))
         target = cloud.points.mT.repeat(1, 1, answer.part.shape[1])
         part, weight = answer.part.flatten(1), answer.weight.flatten(1)
-        feet = feet.transpose(1, 2).flatten(2)
-        local, normal, gap = feet.split((3, 3, 1), 1)
+        chosen = foot.of(posed, cloud.points, answer.index)
+        local, normal = (x.mT.transpose(1, 2).flatten(2) for x in (chosen.local, chosen.normal))
+        gap = foot.square.gather(1, answer.part).flatten(1)
         count = cloud.mask.sum(1, keepdim=True).clamp_min(1)
         weight = weight * (config.effective_points / count).clamp_max(1)
         if config.robust_sd > 0:  # Geman and McClure
-            weight = weight / (1 + gap[:, 0] / config.robust_sd**2) ** 2
+            weight = weight / (1 + gap / config.robust_sd**2) ** 2
         # The root of 0 has no derivative; the floor gives it 0.
         tiny = torch.finfo(weight.dtype).tiny
         scale = torch.where(weight > 0, weight.clamp_min(tiny).sqrt(), 0.0) / config.noise_sd
@@ -503,8 +506,9 @@ class Registrar(nn.Module):
                 posed, observation.nearest, observation.camera, config.rim, observation.frame
             )
         count = cloud.mask.sum(1).clamp_min(1)
-        nearest = foot.foot.distance.amin(1) * cloud.mask
-        fit = foot.square.gather(1, foot.part).amin(1).clamp_min(0).sqrt() * cloud.mask
+        fit, index = foot.square.gather(1, foot.part).min(1, keepdim=True)
+        nearest = foot.of(posed, cloud.points, index).distance[:, 0] * cloud.mask
+        fit = fit[:, 0].clamp_min(0).sqrt() * cloud.mask
         # The bound stands in for the points' rows, with every label and none.
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
         others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
@@ -515,6 +519,18 @@ class Registrar(nn.Module):
         return Registration(
             pose, doubt, labelling.belief, nearest, nearest.sum(1) / count, misfit, score, bound, status
         )
+
+
+def nearest_parts(
+    square: Float[Tensor, "*batch parts num"], count: int
+) -> Int[Tensor, "*batch few num"]:
+    """Of each point the `count` parts with the least distances, the nearest first."""
+    few: list[Tensor] = []
+    for _ in range(count):  # by one least value after another: for two of them twice as fast as `topk`
+        if few:
+            square = square.scatter(-2, few[-1], torch.inf)
+        few.append(square.min(-2, keepdim=True).indices)
+    return torch.cat(few, -2)
 
 
 def _inverse(
