@@ -7,9 +7,10 @@ import torch
 from synthetic_cloud import CAMERA, mirrored, see, standing, together
 from torch.testing import assert_close
 
+from torchpose.body.ellipsoid import rough_distance
 from torchpose.body.model import BodyModel
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
-from torchpose.registration.silhouette import RimConfig
+from torchpose.registration.silhouette import RimConfig, silhouette_residual
 from torchpose.registration.vem import Registrar, RegistrationConfig
 
 
@@ -143,3 +144,48 @@ def test_half_of_the_points_weigh_as_much_as_all(scene):
     slope = (x * y).sum(2) / x.square().sum(2)
     assert ((slope > 0.8) & (slope < 1.25)).all()
     assert ((x * y).sum(2) / (x.norm(dim=2) * y.norm(dim=2)) > 0.95).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.006], ids=["exact", "noisy along rays"])
+@pytest.mark.parametrize("outlier", [3.0, 0.0])
+def test_a_pair_of_limbs_is_judged_as_the_whole_body_with_them(noise, outlier):
+    """Beside every part's distance at each point, with rims, in a frame of two."""
+    torch.manual_seed(0)
+    body = BodyModel().double()
+    # Without "no part" points far from all parts would lie more than the 80 nats below that are told apart.
+    sigma = 0.03 if outlier > 0 else 0.15
+    config = RegistrationConfig(outlier=outlier, sigma_last=sigma, rim=RimConfig(weight=1.0))
+    search = LimbSearch(body, Registrar(body, config))
+    truth = torch.cat([standing(body, yaw=0.2), standing(body, yaw=-0.4, x=0.3)])
+    view = together([see(body, pose[None]) for pose in truth])
+    view = replace(view, depth_noise=noise, potential=torch.randn_like(view.potential))
+    size = 1 + 0.05 * torch.randn(2, len(body.size_names), dtype=torch.float64)
+    places = truth[:, search.limbs][:, :, None] + 0.2 * torch.randn(2, 4, 3, 4, dtype=torch.float64)
+    found = search.score_pairs(view, truth, places, size)
+    assert found.shape == (2, 2, 3, 3)
+
+    def log_density(frame, moved):
+        one, posed = view.take(torch.tensor([frame])), body(moved[None], size[frame : frame + 1])
+        far = rough_distance(search.registrar.pressed(posed, one)[0], one.cloud.points)[0]
+        labels = one.potential[0].T - far**2 / (2 * config.sigma_last**2)
+        if outlier > 0:
+            labels = torch.cat([labels, torch.full_like(labels[:1], -(outlier**2) / 2)])
+        there = one.cloud.mask[0]
+        weight = min(1.0, config.effective_points / int(there.sum()))
+        rims = silhouette_residual(posed, one.nearest, one.camera, config.rim)
+        return weight * labels.logsumexp(0)[there].sum() - 0.5 * (rims**2).sum()
+
+    assert search.pairs().tolist() == [[0, 1], [2, 3]]
+    for frame in range(2):
+        for pair, limbs in enumerate(search.pairs().tolist()):
+            whole = torch.zeros(3, 3, dtype=torch.float64)
+            for i in range(3):
+                for j in range(3):
+                    moved = truth[frame].clone()
+                    for limb, place in zip(limbs, (i, j), strict=True):
+                        moved[search.limbs[limb]] = places[frame, limb, place]
+                    whole[i, j] = log_density(frame, moved)
+            assert whole.std() > 1
+            ours = found[frame, pair]
+            # Silhouettes are in single precision.
+            assert_close(ours - ours[0, 0], whole - whole[0, 0], atol=1e-4, rtol=0)

@@ -180,38 +180,72 @@ def test_the_pelvis_is_guessed_within_an_eighth_of_a_metre(body, face):
         assert (guess - pose[:, :3]).norm() < 0.125
 
 
+def arms(body, side):
+    return [i for i, name in enumerate(body.parameter_names) if f"arm_{side}" in name]
+
+
 def test_exchanged_limbs_are_all_pairs_of_the_best(body, starter):
+    """All of them, where as many are asked for."""
+    view = see(body, standing(body)).observation()
     poses = standing(body).repeat(10, 1)
     poses[:, 6:] += torch.arange(10)[:, None] * 0.2
     score = torch.tensor([9.0, 3, 8, 1, 7, 2, 6, 4, 5, 0])
-    (combined,), new = starter._exchange(poses[None], score[None], ("upper_arm", "forearm"))
-    assert combined.shape == (64, 24)
-    assert new[0, 1:].all()
-    assert not new[0, 0]  # the best start itself
-    left = body.parameter_names.index("forearm_left_1")
-    right = body.parameter_names.index("upper_arm_right_2")
-    pairs = {
-        (round(a, 4), round(b, 4)) for a, b in (combined[:, [left, right]] - poses[0, [left, right]]).tolist()
-    }
+    every = Starter(body, replace(starter.config, combined=128), RegistrationConfig())
+    (combined,), new = every._exchange(view, poses[None], score[None], body.default_size(1), None)
+    assert combined.shape == (128, 24)
+    # The best start itself comes twice, and is not taken.
+    itself = (combined == poses[9]).all(1)
+    assert itself.sum() == 2
+    assert torch.equal(~itself, new[0])
     best = [round(0.2 * i, 4) for i in (9, 3, 5, 1, 7, 8, 6, 4)]
-    assert pairs == {(a, b) for a in best for b in best}
-    rest = [i for i, name in enumerate(body.parameter_names) if "arm" not in name]
-    assert_close(combined[:, rest], poses[9, rest].expand(64, -1))
+    for kind, other in (("forearm", "upper_arm"), ("shank", "thigh")):
+        left = body.parameter_names.index(f"{kind}_left_1")
+        right = body.parameter_names.index(f"{other}_right_2")
+        both = combined[:, [left, right]] - poses[0, [left, right]]
+        pairs = {(round(a, 4), round(b, 4)) for a, b in both.tolist()}
+        assert pairs == {(a, b) for a in best for b in best}
+    moved = (combined != poses[9]).any(0)
+    assert not moved[:8].any()  # root and head
+    both = arms(body, "left") + arms(body, "right")
+    armed, legged = ((combined[:, own] != poses[9, own]).any(1) for own in (both, slice(16, 24)))
+    assert not (armed & legged).any()
+
+
+def test_of_the_combinations_the_likeliest_are_taken(body, starter):
+    """Arms to the sides are seen. No start has both, the best one has none."""
+    truth = standing(body, limbs(body, **T_POSE))
+    view = see(body, truth).observation()
+    poses = truth.repeat(5, 1)
+    for start, side in ((0, "left"), (0, "right"), (1, "left"), (2, "right"), (3, "left"), (3, "right")):
+        poses[start, arms(body, side)] = standing(body)[0, arms(body, side)] + 0.1 * start
+    poses[4, arms(body, "left") + arms(body, "right")] += 0.5
+    few = Starter(body, replace(starter.config, combined=1), RegistrationConfig())
+    score = torch.arange(5.0)[None]
+    (combined,), new = few._exchange(view, poses[None], score, body.default_size(1), None)
+    assert new.all()
+    assert_close(combined, truth)
+    # A prior that is sure of a hanging left arm is heard.
+    precision = torch.zeros_like(truth)
+    precision[:, arms(body, "left")] = 1e6
+    prior = PosePrior(standing(body), precision)
+    (combined,), _ = few._exchange(view, poses[None], score, body.default_size(1), prior)
+    assert_close(combined[:, arms(body, "left")], standing(body)[:, arms(body, "left")])
 
 
 def test_limbs_that_hardly_differ_from_those_of_better_starts_are_not_exchanged_again(body, starter):
     """Of left arms at 0, 0.05, 0.15 and 0.02, that of the best start, one other is left; of equal right arms none."""
     poses = standing(body).repeat(2, 4, 1)
-    left = [i for i, name in enumerate(body.parameter_names) if "arm_left" in name]
+    left = arms(body, "left")
     poses[0, :, left] += torch.tensor([0.0, 0.05, 0.15, 0.02])[:, None]
     score = torch.tensor([3.0, 1.0, 2.0, 0.0]).expand(2, 4)
+    view = see(body, standing(body)).observation().take(torch.tensor([0, 0]))
     some = Starter(body, replace(starter.config, apart=0.05), RegistrationConfig())
-    combined, new = some._exchange(poses, score, ("upper_arm", "forearm"))
+    combined, new = some._exchange(view, poses, score, body.default_size(1), None)
     moved = combined[0, new[0]][:, left] - standing(body)[:, left]
     assert_close(moved, torch.full((1, len(left)), 0.15))
     assert not new[1].any()  # the other frame's starts are all alike
-    everything = Starter(body, replace(starter.config, apart=0.0), RegistrationConfig())
-    assert everything._exchange(poses, score, ("upper_arm", "forearm"))[1][:, 1:].all()
+    every = Starter(body, replace(starter.config, apart=0.0), RegistrationConfig())
+    assert every._exchange(view, poses, score, body.default_size(1), None)[1].sum() == 2 * 30
 
 
 def test_a_pose_turned_away_must_fit_better(body, starter):

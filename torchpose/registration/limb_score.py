@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.ellipsoid import flattened, foot_of_part, rough_square
+from torchpose.body.ellipsoid import foot_of_part, rough_square
 from torchpose.body.model import PosedBody
 from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.limb_search import LEAST, LimbSearch
@@ -69,7 +69,7 @@ class LimbScore(nn.Module):
         """What all places of the limbs of some frames have in common."""
         config, points = self.registrar.config, observation.cloud.points
         posed = self.body(pose, size)
-        pressed = self._pressed(posed, observation)
+        pressed, _ = self.registrar.pressed(posed, observation)
         square = rough_square(pressed, points, config.visible)
         F, K = square.shape[:2]
         own = torch.zeros(len(self.parts), K, dtype=torch.bool, device=pose.device).scatter(
@@ -123,7 +123,7 @@ class LimbScore(nn.Module):
         whole = self.body(pose, known.size[frame])
         own = self.parts[limb]  # (rows, own)
         posed = _chosen(whole, own)
-        pressed = self._pressed(posed, observation)
+        pressed, _ = self.registrar.pressed(posed, observation)
         at = torch.arange(len(own), device=own.device)[:, None], own  # of a table of all parts the limb's
         near, rough = known.near[frame, limb], known.rough[frame, limb]
         # A part is judged by its exact distance where it is among the nearest of all parts.
@@ -186,12 +186,6 @@ class LimbScore(nn.Module):
         count = (cloud.mask.sum(1, keepdim=True) + 1) // 2
         own = torch.arange(half.cloud.mask.shape[1], device=limb.device) < count
         return replace(half, cloud=replace(half.cloud, mask=half.cloud.mask & own))
-
-    def _pressed(self, posed: PosedBody, observation: Observation) -> PosedBody:
-        """The parts as `Registrar.correspond` takes them."""
-        if observation.depth_noise == 0:
-            return posed
-        return flattened(posed, self.registrar.trust(posed, observation))[0]
 
     def _exact(
         self, posed: PosedBody, points: Tensor, square: Tensor, where: Bool[Tensor, "rows parts num"]

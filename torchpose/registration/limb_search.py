@@ -48,6 +48,7 @@ class LimbSearch(nn.Module):
     limbs: Tensor  # (limbs, 4) parameters of each
     places: Tensor  # (limbs, candidates, 4) rad
     own: Tensor  # (limbs, parts) bool: parts that the limb's first parameter moves
+    beside: Tensor  # (limbs,) the limb of the other side; -1 where there is none
 
     def __init__(self, body: BodyModel, registrar: Registrar, config: LimbSearchConfig = LimbSearchConfig()):
         super().__init__()
@@ -60,6 +61,11 @@ class LimbSearch(nn.Module):
         self.register_buffer("limbs", limbs, persistent=False)
         self.register_buffer("places", low + even.to(low) * (high - low), persistent=False)
         self.register_buffer("own", body.part_moves[:, first].T, persistent=False)
+        names = [_unsided(body.parameter_names[k]) for k in first.tolist()]
+        beside = [
+            next((n for n, b in enumerate(names) if n != k and a == b), -1) for k, a in enumerate(names)
+        ]
+        self.register_buffer("beside", torch.tensor(beside), persistent=False)
 
     def forward(
         self,
@@ -98,13 +104,8 @@ class LimbSearch(nn.Module):
         exact: bool,
     ) -> Float[Tensor, "batch limbs candidates"]:
         """Log-density of the points and of the rims, up to a constant for each limb."""
-        B, L, C = places.shape[:3]
-        parts = torch.stack([own.nonzero()[:, 0] for own in self.own])  # (L, own parts)
-        # A limb's parts hang on the root and on their own parameters alone: all limbs are moved at once.
-        moved = pose[:, None].repeat(1, C, 1)
-        moved[:, :, self.limbs] = places.transpose(1, 2)
-        sizes = size.expand(B, -1).repeat_interleave(C, 0)
-        limbs = _only(self.body(moved.flatten(0, 1), sizes), parts.flatten(), B)
+        L, C = places.shape[1:3]
+        limbs, parts = self._moved(pose, places, size)
         # To first order every other point will do; the few best are judged by all of them.
         step, registrar = 1 if exact else 2, self.registrar
         points, mask = observation.cloud.points[:, ::step], observation.cloud.mask[:, None, None, ::step]
@@ -129,13 +130,76 @@ class LimbSearch(nn.Module):
             total = (inside - most[:, :, :, None]).clamp_min_(LEAST).exp_().sum(3)
             total = total + (rest[:, None] - most).clamp_min_(LEAST).exp_()
             bounds.append(((most + total.log_()) * mask).sum(3))
-        score = share * torch.cat(bounds, 1)
+        score = (share * torch.cat(bounds, 1)).transpose(1, 2)
         if registrar.config.rim.weight > 0:
-            rims = silhouette_residual(
-                limbs, observation.nearest, observation.camera, registrar.config.rim, observation.frame
-            )
-            score = score - 0.5 * rims.square().unflatten(1, (C, L, -1)).sum(3)
-        return score.transpose(1, 2)
+            score = score - self._rims(observation, limbs, places)
+        return score
+
+    def pairs(self) -> Int[Tensor, "pairs 2"]:
+        """Each limb and the one of its other side."""
+        first = torch.arange(len(self.beside), device=self.beside.device)
+        return torch.stack([first, self.beside], 1)[self.beside > first]
+
+    def score_pairs(
+        self,
+        observation: Observation,
+        pose: Float[Tensor, "batch parameters"],
+        places: Float[Tensor, "batch limbs candidates 4"],
+        size: Float[Tensor, "#batch sizes"],
+    ) -> Float[Tensor, "batch pairs candidates candidates"]:
+        """Log-density of frames with both limbs of a pair in any of their places, the rest of the body as in `pose`.
+
+        Each point is of the limbs, the rest or none, as the registrar judges them, to first order and without what
+        hides what: for all combinations of places only these three sums are added anew.
+        """
+        registrar, config, points = self.registrar, self.registrar.config, observation.cloud.points
+        limbs, parts = self._moved(pose, places, size)
+
+        def square(posed: PosedBody) -> Tensor:
+            return rough_square(registrar.pressed(posed, observation)[0], points, config.visible)
+
+        C, appearance = places.shape[2], observation.potential.mT
+        moved = appearance[:, None, parts] - square(limbs).unflatten(1, (C, *parts.shape)) / (
+            2 * config.sigma_last**2
+        )
+        still = appearance - square(self.body(pose, size)) / (2 * config.sigma_last**2)  # (B, parts, N)
+        none = torch.full_like(still[:, :1], -0.5 * config.outlier**2 if config.outlier > 0 else -torch.inf)
+        most = torch.maximum(torch.cat([still, none], 1).amax(1), moved.flatten(1, 3).amax(1))
+        limb = (moved - most[:, None, None, None]).clamp_min_(LEAST).exp_().sum(3)  # (B, C, L, N)
+        left, right = limb[:, :, self.pairs()].permute(3, 0, 2, 1, 4)  # (B, pairs, C, N) each
+        others = ~self.own[self.pairs()].any(1)  # (pairs, parts)
+        rest = others.to(still) @ (still - most[:, None]).clamp_min_(LEAST).exp_()
+        rest = rest + (none - most[:, None]).clamp_min_(LEAST).exp_()
+        total = (left[:, :, :, None] + right[:, :, None] + rest[:, :, None, None]).log_()
+        count = observation.cloud.mask.sum(1).clamp_min(1)
+        bound = ((total + most[:, None, None, None]) * observation.cloud.mask[:, None, None, None]).sum(4)
+        score = bound * (config.effective_points / count).clamp_max(1)[:, None, None, None]
+        if config.rim.weight == 0:
+            return score
+        left, right = self._rims(observation, limbs, places)[:, self.pairs()].permute(2, 0, 1, 3)
+        return score - left[..., None] - right[:, :, None]
+
+    def _moved(
+        self, pose: Tensor, places: Float[Tensor, "batch limbs candidates 4"], size: Tensor
+    ) -> tuple[PosedBody, Int[Tensor, "limbs own"]]:
+        """The limbs' ellipsoids in all places, as those of one body of each frame, candidates first; and their parts.
+
+        They hang on the root and on their own parameters alone: all limbs are moved at once.
+        """
+        B, C = len(pose), places.shape[2]
+        parts = torch.stack([own.nonzero()[:, 0] for own in self.own])
+        moved = pose[:, None].repeat(1, C, 1)
+        moved[:, :, self.limbs] = places.transpose(1, 2)
+        sizes = size.expand(B, -1).repeat_interleave(C, 0)
+        return _only(self.body(moved.flatten(0, 1), sizes), parts.flatten(), B), parts
+
+    def _rims(
+        self, observation: Observation, limbs: PosedBody, places: Tensor
+    ) -> Float[Tensor, "batch limbs candidates"]:
+        """What the rims of each limb in each place cost, nats."""
+        rim, shape = self.registrar.config.rim, (places.shape[2], places.shape[1], -1)
+        residual = silhouette_residual(limbs, observation.nearest, observation.camera, rim, observation.frame)
+        return 0.5 * residual.square().unflatten(1, shape).sum(3).transpose(1, 2)
 
     def _rest_of_body(
         self, observation: Observation, pose: Tensor, size: Tensor
@@ -163,3 +227,7 @@ def _pieces(posed: PosedBody, size: int) -> Iterator[PosedBody]:
     for k in range(0, posed.centers.shape[1], size):
         own = {name: getattr(posed, name)[:, k : k + size] for name in ("centers", "frames", "radii")}
         yield replace(posed, **own)
+
+
+def _unsided(name: str) -> str:
+    return name.replace("left", "").replace("right", "")

@@ -52,7 +52,8 @@ class StartConfig:
     finalists: int = 4
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
     exchanged: int = 8  # best starts whose limbs are exchanged
-    apart: float = 0.0  # rad by which limbs differ that are exchanged: the others end in the same place
+    apart: float = 0.03  # rad by which limbs differ that are exchanged: the others end in the same place
+    combined: int = 32  # of their combinations that are fitted, the likeliest as they stand
     good_misfit: float = 0.020  # m; a worse answer is refreshed limb by limb
     refreshes: int = 1  # at the most
     # m, in a refresh's first rounds on few points and on all: all but a limb or two are right
@@ -65,7 +66,7 @@ class StartConfig:
     walk: WalkConfig = field(default_factory=WalkConfig)
 
     def __post_init__(self) -> None:
-        for name in ("points", "rounds", "final_rounds", "finalists", "exchanged"):
+        for name in ("points", "rounds", "final_rounds", "finalists", "exchanged", "combined"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.apart < 0:
@@ -140,9 +141,8 @@ class Starter(nn.Module):
         prior: PosePrior | None = None,
         walking: float | None = None,
     ) -> Registration:
-        """Every start of each frame is fitted on a few points, the limbs of the good ones are exchanged in all pairs,
-        and the best few combinations are fitted on all points. Of each frame the registration with the least misfit is
-        returned."""
+        """Every start of each frame is fitted on a few points, the limbs of the good ones are exchanged, and the best
+        few combinations are fitted on all points. Of each frame the registration with the least misfit is returned."""
         few, (B, S, P) = thin(observation, self.config.points), starts.shape
         row = torch.arange(B, device=starts.device)
         every = row.repeat_interleave(S)
@@ -150,10 +150,9 @@ class Starter(nn.Module):
             self.coarse, few, every, starts.flatten(0, 1), size, prior, self.config.rounds, sigma
         )
         pose, score = rough.pose.view(B, S, P), self.score(rough, walking).view(B, S)
-        arms, new_arms = self._exchange(pose, score, ("upper_arm", "forearm"))
-        legs, new_legs = self._exchange(pose, score, ("thigh", "shank"))
-        combined = torch.cat([pose, arms, legs], 1)
-        new = torch.cat([torch.ones_like(score, dtype=torch.bool), new_arms, new_legs], 1)
+        exchanged, worth = self._exchange(few, pose, score, size, prior)
+        combined = torch.cat([pose, exchanged], 1)
+        new = torch.cat([torch.ones_like(score, dtype=torch.bool), worth], 1)
         last, every = self.registrar.config.sigma_last, new.nonzero()[:, 0]
         again = self._fit(self.coarse, few, every, combined[new], size, prior, 1, last)
         rank = torch.full_like(combined[..., 0], torch.inf).masked_scatter(new, self.score(again, walking))
@@ -223,27 +222,40 @@ class Starter(nn.Module):
 
     def _exchange(
         self,
+        observation: Observation,
         pose: Float[Tensor, "batch starts parameters"],
         score: Float[Tensor, "batch starts"],
-        limb: tuple[str, str],
+        size: Float[Tensor, "#batch sizes"],
+        prior: PosePrior | None,
     ) -> tuple[Float[Tensor, "batch combinations parameters"], Bool[Tensor, "batch combinations"]]:
-        """The best start with each left and each right limb of the best starts; and which of these combinations are
-        no repetition: not that start itself, and of limbs that differ from those of all better starts."""
-        names = self.body.parameter_names
-        order = score.argsort(1)[:, : self.config.exchanged]
+        """The best start with the left and right arm, or leg, of any two of the best starts, in the likeliest of these
+        combinations; and which of them are no repetition: of limbs that differ from those of all better starts, and
+        not that start itself."""
+        search, config = self.limb_search, self.config
+        order = score.argsort(1)[:, : config.exchanged]
         good = pose.gather(1, order[..., None].expand(-1, -1, pose.shape[2]))  # the best first
-        rank = torch.arange(good.shape[1], device=pose.device)
-        left, right = (part.flatten() for part in torch.meshgrid(rank, rank, indexing="ij"))
-        combined = good[:, :1].repeat(1, len(left), 1)
-        new = torch.ones_like(combined[..., 0], dtype=torch.bool)
-        for side, chosen in (("_left", left), ("_right", right)):
-            own = [i for i, name in enumerate(names) if name.startswith((limb[0] + side, limb[1] + side))]
-            limbs = good[..., own]
-            near = (limbs[:, :, None] - limbs[:, None]).abs().amax(3) < self.config.apart
-            combined[..., own] = limbs[:, chosen]
-            new &= ~near.tril(-1).any(2)[:, chosen]
-        new[:, 0] = False
-        return combined, new
+        places = good[:, :, search.limbs].transpose(1, 2)  # (B, L, H, 4)
+        likely = search.score_pairs(observation, good[:, 0], places, size).nan_to_num(nan=-torch.inf)
+        near = (places[:, :, :, None] - places[:, :, None]).abs().amax(4) < config.apart
+        fresh, cost = ~near.tril(-1).any(3), torch.zeros_like(places[..., 0])  # (B, L, H)
+        if prior is not None:
+            mean, precision = (x[:, search.limbs][:, :, None] for x in (prior.mean, prior.precision))
+            cost = 0.5 * (precision * (places - mean).square()).sum(3)
+        left, right = search.pairs().unbind(1)
+        new = fresh[:, left, :, None] & fresh[:, right, None]  # (B, pairs, H, H)
+        new[..., 0, 0] = False
+        rank = likely - cost[:, left, :, None] - cost[:, right, None]
+        # What the best start itself has is the same for all pairs but for its own rims and prior.
+        rank = torch.where(new, rank - rank[..., :1, :1], -torch.inf).flatten(1)
+        best = rank.topk(min(config.combined, rank.shape[1]), 1)
+        H = good.shape[1]
+        which, one, other = best.indices // H**2, best.indices // H % H, best.indices % H
+        combined = good[:, :1].repeat(1, best.indices.shape[1], 1)
+        for limb, from_start in ((left[which], one), (right[which], other)):
+            own = search.limbs[limb]  # (B, M, 4)
+            source = good.gather(1, from_start[..., None].expand(-1, -1, good.shape[2]))
+            combined = combined.scatter(2, own, source.gather(2, own))
+        return combined, new.flatten(1).gather(1, best.indices)
 
     def turned_away(self, found: Registration) -> bool:
         """Whether a registration (batch 1) shows the person's back."""

@@ -321,10 +321,7 @@ class Registrar(nn.Module):
         """The model's points that may answer for each data point, and its distances from all parts."""
         config, points = self.config, observation.cloud.points
         K = self.body.num_parts
-        # Where depths are noisier than `ray_sd`, distances along the ray count for less: the body is taken flatter.
-        seen, back = posed, None
-        if observation.depth_noise > 0:
-            seen, back = flattened(posed, self.trust(posed, observation))
+        seen, back = self.pressed(posed, observation)
         if not config.hard:
             part = torch.arange(K, device=points.device)[:, None].expand(len(points), K, points.shape[1])
             foot = foot_point(seen, points, config.visible)
@@ -336,6 +333,15 @@ class Registrar(nn.Module):
             foot = foot_of_part(seen, part, points, config.visible)
             square = rough.scatter(1, part, foot.residual.square().sum(-1))
         return Correspondence(part, foot, square, back)
+
+    def pressed(
+        self, posed: PosedBody, observation: Observation
+    ) -> tuple[PosedBody, Float[Tensor, "batch parts 3 3"] | None]:
+        """The body as distances are measured to: where depths are noisier than `ray_sd` those along the ray count for
+        less, and it is `flattened`. Beside it what `flattened` returns; None where it is the body itself."""
+        if observation.depth_noise == 0:
+            return posed, None
+        return flattened(posed, self.trust(posed, observation))
 
     def trust(self, posed: PosedBody, observation: Observation) -> Float[Tensor, "batch parts"]:
         """How much a distance along the ray counts at each part: less where it is noise of more than `ray_sd`."""
@@ -521,9 +527,7 @@ class Registrar(nn.Module):
         )
 
 
-def nearest_parts(
-    square: Float[Tensor, "*batch parts num"], count: int
-) -> Int[Tensor, "*batch few num"]:
+def nearest_parts(square: Float[Tensor, "*batch parts num"], count: int) -> Int[Tensor, "*batch few num"]:
     """Of each point the `count` parts with the least distances, the nearest first."""
     few: list[Tensor] = []
     for _ in range(count):  # by one least value after another: for two of them twice as fast as `topk`

@@ -95,8 +95,6 @@ class Table:
 class LimbHypotheses(nn.Module):
     """Chooses among several places of each limb over a stretch of frames."""
 
-    beside: Tensor  # (limbs,) the limb of the other side
-
     def __init__(self, body: BodyModel, registrar: Registrar, config: HypothesisConfig = HypothesisConfig()):
         super().__init__()
         self.body, self.config = body, config
@@ -108,13 +106,6 @@ class LimbHypotheses(nn.Module):
         effective = registrar.config.effective_points / 2  # see `nearer_half`
         self.fitter = Registrar(body, replace(self.registrar.config, effective_points=effective))
         self.score = LimbScore(self.search, config.occlusion)
-        names = [body.parameter_names[limb[0]] for limb in self.search.limbs.tolist()]
-        # Arms compete for the same points, and so do legs: each limb and that of the other side.
-        kinds = [_unsided(name) for name in names]
-        beside = [
-            next((n for n, b in enumerate(kinds) if n != k and a == b), -1) for k, a in enumerate(kinds)
-        ]
-        self.register_buffer("beside", torch.tensor(beside), persistent=False)
 
     def forward(
         self,
@@ -148,7 +139,8 @@ class LimbHypotheses(nn.Module):
                 chosen[:, own] = best_sequence(_sound(table.cost[:, own]), step)
                 table = table.first(chosen)
                 pose = pose.scatter(1, limbs[own].expand(T, -1), table.place[:, limb, 0])
-                beside = (chosen[:, own] > 0) & (self.beside == limb)
+                # Arms compete for the same points, and so do legs.
+                beside = (chosen[:, own] > 0) & (self.search.beside == limb)
                 table = work.again(table, pose, beside)
         weight = weights(_sound(table.cost), step_cost(table.place, pulls))
         more = spread(table.place, weight, table.place[:, :, 0])
@@ -320,10 +312,6 @@ class _Work:
         which = table.cost.isfinite() & some[..., None]
         cost = self._cost(pose, table.place, which, self._known(pose, which))
         return Table(table.place, torch.where(some[..., None], cost, table.cost))
-
-
-def _unsided(name: str) -> str:
-    return name.replace("left", "").replace("right", "")
 
 
 def _sound(cost: Tensor) -> Tensor:
