@@ -39,8 +39,8 @@ class FootPoint:
     def take(self, index: Int[Tensor, "batch few num"]) -> "FootPoint":
         """Those numbered `index` among each point's."""
         wide = index[..., None].expand(-1, -1, -1, 3).mT
-        vectors = (x.mT.gather(1, wide).mT for x in (self.local, self.normal, self.residual))
-        return FootPoint(*vectors, self.hidden.gather(1, index))
+        local, normal, residual = (x.mT.gather(1, wide).mT for x in (self.local, self.normal, self.residual))
+        return FootPoint(local, normal, residual, self.hidden.gather(1, index))
 
 
 def to_local(posed: PosedBody, points: Float[Tensor, "batch num 3"]) -> Float[Tensor, "batch parts num 3"]:

@@ -104,7 +104,6 @@ class LimbSearch(nn.Module):
         exact: bool,
     ) -> Float[Tensor, "batch limbs candidates"]:
         """Log-density of the points and of the rims, up to a constant for each limb."""
-        L, C = places.shape[1:3]
         limbs, parts = self._moved(pose, places, size)
         # To first order every other point will do; the few best are judged by all of them.
         step, registrar = 1 if exact else 2, self.registrar

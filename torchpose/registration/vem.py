@@ -211,7 +211,7 @@ class Correspondence:
     back: Float[Tensor, "batch parts 3 3"] | None = None  # of `flattened`
 
     def of(self, posed: PosedBody, points: Float[Tensor, "batch num 3"], index: Tensor | None) -> FootPoint:
-        """Of each point the foot points numbered `index` (B, few, N), None for all, on the parts as they are `posed`."""
+        """Of each point those numbered `index` (B, few, N), None for all, on the parts as they are `posed`."""
         foot, part = self.foot, self.part
         if index is not None:
             foot, part = foot.take(index), part.gather(1, index)

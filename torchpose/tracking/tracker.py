@@ -54,6 +54,7 @@ class TrackingConfig:
     search_slack: float = (
         3.0  # times the prediction's standard deviation, within which limbs are sought elsewhere
     )
+    jump: float = 0.4  # rad by which a search moves a joint, whose velocity is not believed then
     look_around: float = 0.5  # s after which limbs are sought elsewhere although nothing seems wrong
     memory: float = 2.0  # s after which a lost person is forgotten
 
@@ -70,6 +71,7 @@ class TrackingConfig:
             "doubt",
             "retry",
             "look_around",
+            "jump",
             "search_slack",
             "against",
             "aside",
@@ -185,6 +187,8 @@ class Tracker(nn.Module):
         predicted = self._pose
         if self._velocity is not None:
             predicted = self._pose + self.config.velocity * elapsed * self._velocity
+            joints = predicted[:, 6:].clamp(self.body.low[6:], self.body.high[6:])
+            predicted = torch.cat([predicted[:, :6], joints], 1)
         sd = torch.full_like(predicted, self.config.joint_speed_sd * elapsed)
         sd[:, :6] = self.config.root_speed_sd * elapsed
         precision = sd**-2
@@ -266,6 +270,7 @@ class Tracker(nn.Module):
         assert person.observation is not None
         assert person.faces is not None
         status = TrackStatus.partial if person.cut else TrackStatus.tracked
+        followed = found.pose
         if other is not None:
             self._looked = person.time_s
             if bool(is_finite(other)[0]) and bool(other.score < found.score):
@@ -294,6 +299,10 @@ class Tracker(nn.Module):
         if not self.acceptable(found):
             return TrackedFrame(TrackStatus.lost, None)
         self._remember(found, person.time_s)
+        if self._velocity is not None:
+            jumped = (found.pose - followed).abs() > self.config.jump
+            jumped[:, :6] = False
+            self._velocity = torch.where(jumped, 0.0, self._velocity)
         return TrackedFrame(status, found)
 
     def _against(self, found: Registration, walking: float) -> bool:
