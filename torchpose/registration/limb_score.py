@@ -16,6 +16,7 @@ from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.limb_search import LEAST, LimbSearch
 from torchpose.registration.occlusion import OcclusionConfig, behind, entries
 from torchpose.registration.silhouette import silhouette_residual
+from torchpose.registration.solid import core_of, solid_residual
 from torchpose.registration.start import picked
 from torchpose.registration.vem import Distance, Observation, Registrar, nearest_parts
 
@@ -149,6 +150,9 @@ class LimbScore(nn.Module):
         score = -bound * (config.effective_points / count).clamp_max(1)
         if config.rim.weight > 0:
             score = score + 0.5 * (known.rims[frame, limb] + self._rims(posed, observation).sum(1))
+        if config.solid.sd > 0:
+            inside = solid_residual(core_of(whole, self.registrar.limbs), posed.centers, config.solid)
+            score = score + 0.5 * inside.square().sum((1, 2))
         nothing = PosePrior(pose, torch.zeros_like(pose))
         seen = (best > none) & cloud.mask[:, None]
         support = ((potential == best) & seen).sum(2).to(pose)

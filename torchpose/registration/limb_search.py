@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from torchpose.body.ellipsoid import FEW_STEPS, foot_point, rough_square
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.registration.silhouette import silhouette_residual
+from torchpose.registration.solid import core_of, limb_roots, solid_residual
 from torchpose.registration.vem import Observation, Registrar
 
-# A limb is a body on the root that others hang from: its joint, and that of the body after it, have four parameters.
+# Of a limb: of its first joint, and of the one after it.
 PARAMETERS = 4
 AT_ONCE = (
     2**17
@@ -53,8 +54,7 @@ class LimbSearch(nn.Module):
     def __init__(self, body: BodyModel, registrar: Registrar, config: LimbSearchConfig = LimbSearchConfig()):
         super().__init__()
         self.body, self.registrar, self.config = body, registrar, config
-        roots = [k for k, parent in enumerate(body.parents, 1) if parent == 0 and k in body.parents]
-        first = torch.tensor([6 + 2 * (k - 1) for k in roots])
+        first = torch.tensor([6 + 2 * (k - 1) for k in limb_roots(body)])
         limbs = first[:, None] + torch.arange(PARAMETERS)
         even = torch.quasirandom.SobolEngine(PARAMETERS, scramble=True, seed=0).draw(config.candidates)
         low, high = body.low[limbs][:, None], body.high[limbs][:, None]
@@ -130,9 +130,7 @@ class LimbSearch(nn.Module):
             total = total + (rest[:, None] - most).clamp_min_(LEAST).exp_()
             bounds.append(((most + total.log_()) * mask).sum(3))
         score = (share * torch.cat(bounds, 1)).transpose(1, 2)
-        if registrar.config.rim.weight > 0:
-            score = score - self._rims(observation, limbs, places)
-        return score
+        return score - self._beside_points(observation, pose, size, limbs, places)
 
     def pairs(self) -> Int[Tensor, "pairs 2"]:
         """Each limb and the one of its other side."""
@@ -173,9 +171,9 @@ class LimbSearch(nn.Module):
         count = observation.cloud.mask.sum(1).clamp_min(1)
         bound = ((total + most[:, None, None, None]) * observation.cloud.mask[:, None, None, None]).sum(4)
         score = bound * (config.effective_points / count).clamp_max(1)[:, None, None, None]
-        if config.rim.weight == 0:
-            return score
-        left, right = self._rims(observation, limbs, places)[:, self.pairs()].permute(2, 0, 1, 3)
+        left, right = self._beside_points(observation, pose, size, limbs, places)[:, self.pairs()].permute(
+            2, 0, 1, 3
+        )
         return score - left[..., None] - right[:, :, None]
 
     def _moved(
@@ -192,13 +190,22 @@ class LimbSearch(nn.Module):
         sizes = size.expand(B, -1).repeat_interleave(C, 0)
         return _only(self.body(moved.flatten(0, 1), sizes), parts.flatten(), B), parts
 
-    def _rims(
-        self, observation: Observation, limbs: PosedBody, places: Tensor
+    def _beside_points(
+        self, observation: Observation, pose: Tensor, size: Tensor, limbs: PosedBody, places: Tensor
     ) -> Float[Tensor, "batch limbs candidates"]:
-        """What the rims of each limb in each place cost, nats."""
-        rim, shape = self.registrar.config.rim, (places.shape[2], places.shape[1], -1)
-        residual = silhouette_residual(limbs, observation.nearest, observation.camera, rim, observation.frame)
-        return 0.5 * residual.square().unflatten(1, shape).sum(3).transpose(1, 2)
+        """What its rims cost each limb in each place, and what of it runs through trunk or head, nats."""
+        config, shape = self.registrar.config, (places.shape[2], places.shape[1], -1)
+        cost = torch.zeros_like(places[..., 0])
+        if config.rim.weight > 0:
+            residual = silhouette_residual(
+                limbs, observation.nearest, observation.camera, config.rim, observation.frame
+            )
+            cost = cost + 0.5 * residual.square().unflatten(1, shape).sum(3).transpose(1, 2)
+        if config.solid.sd > 0:
+            core = core_of(self.body(pose, size), self.registrar.limbs)
+            inside = solid_residual(core, limbs.centers, config.solid).square().sum(1)
+            cost = cost + 0.5 * inside.unflatten(1, shape).sum(3).transpose(1, 2)
+        return cost
 
     def _rest_of_body(
         self, observation: Observation, pose: Tensor, size: Tensor

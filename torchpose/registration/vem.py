@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import cache
+from functools import cache, reduce
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -36,6 +36,7 @@ from torchpose.registration.fitting import (
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
 from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
 from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_residual, silhouette_rows
+from torchpose.registration.solid import SolidConfig, core_of, limb_parts, solid_residual, solid_rows
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
 
@@ -75,6 +76,7 @@ class RegistrationConfig:
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     fitting: FittingConfig = field(default_factory=FittingConfig)
     rim: RimConfig = field(default_factory=RimConfig)
+    solid: SolidConfig = field(default_factory=SolidConfig)
     # Of what a body hides of itself, where poses of points noisier than `ray_sd` are judged.
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
 
@@ -245,10 +247,13 @@ def compiling_works(device: str) -> bool:
 class Registrar(nn.Module):
     """Fits a body to observations from given starts. Everything it knows of a person comes as arguments."""
 
+    limbs: Tensor  # (limbs, own) parts of each
+
     def __init__(self, body: BodyModel, config: RegistrationConfig = RegistrationConfig()):
         super().__init__()
         self.body = body
         self.config = config
+        self.register_buffer("limbs", limb_parts(body), persistent=False)
         if config.compile and compiling_works(body.axes.device.type):
             for stage in STAGES:
                 setattr(self, stage, torch.compile(getattr(self, stage)))
@@ -373,19 +378,26 @@ class Registrar(nn.Module):
         rim: bool = True,
         tangential: float | None = None,
     ) -> tuple[Rows, Float[Tensor, "batch parts"]]:
-        """The M-step's rows from beliefs, with the silhouette's if `rim`, and how many points support each part.
+        """The M-step's rows from beliefs, and how many points support each part; if `rim`, the rows have the
+        silhouette's among them and those that keep limbs out of the trunk.
 
         `tangential` overrides the config.
         """
         tangential = self.config.tangential if tangential is None else tangential
         answer = self._answer(foot, labelling.belief, observation.cloud)
         rows = self._point_rows(posed, foot, answer, observation, tangential)
+        others = []
         if rim and self.config.rim.weight > 0:
-            across = silhouette_rows(
-                posed, observation.nearest, observation.camera, self.config.rim, observation.frame
-            )
             # Rims of one part move together, so they count as a few independent measurements, not as many.
-            rows = Rows.cat(rows, across)
+            others.append(
+                silhouette_rows(
+                    posed, observation.nearest, observation.camera, self.config.rim, observation.frame
+                )
+            )
+        if rim and self.config.solid.sd > 0:
+            others.append(solid_rows(posed, self.limbs, self.config.solid))
+        if others:
+            rows = Rows.cat(rows, reduce(Rows.cat, others))
         return rows, self._support(posed, answer, observation.cloud)
 
     def _answer(
@@ -518,6 +530,10 @@ class Registrar(nn.Module):
         # The bound stands in for the points' rows, with every label and none.
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
         others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
+        if config.solid.sd > 0:
+            middles = posed.centers[:, self.limbs.flatten()]
+            inside = solid_residual(core_of(posed, self.limbs), middles, config.solid)
+            others = others + 0.5 * inside.square().sum((1, 2))
         score = others - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
         misfit = fit.clamp_max(0.2).sum(1) / count
         if config.rim.weight > 0:
