@@ -58,6 +58,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "geodesic",
         "moment",
         "fitting",
+        "solid",
         "silhouette",
         "occlusion",
         "vem",

@@ -177,6 +177,39 @@ def test_after_a_recovery_there_is_no_velocity(scripted, step, body):
     assert_close(registrar.starts, starter.pose.expand(2, -1))
 
 
+def test_joints_that_a_search_moved_far_have_no_velocity(scripted, step, body):
+    """All others have theirs, and so has the root, however far it went."""
+    tracker, registrar, starter = scripted
+    step(tracker, 0.0)
+    registrar.pose, registrar.stray = standing(body) + 0.02, 2 * CONFIG.stray_share
+    found = standing(body) + 0.05
+    elbow, hip = 9, 20
+    found[0, [elbow, hip]] += torch.tensor([1.1 * CONFIG.jump, 0.8 * CONFIG.jump])
+    found[0, 0] += 1.0
+    starter.refreshed = registration(found, misfit=GOOD / 2)
+    step(tracker, 0.1)
+    assert starter.calls[-1] == "refresh"
+    step(tracker, 0.2)
+    velocity = (found - standing(body)) / 0.1
+    velocity[0, elbow] = 0
+    assert_close(registrar.starts[:1], found + CONFIG.velocity * 0.1 * velocity)
+
+
+def test_predictions_stay_within_the_limits_of_joints(scripted, step, body):
+    tracker, registrar, _ = scripted
+    step(tracker, 0.0)
+    knee = body.parameter_names.index("shank_left_2")
+    registrar.pose = standing(body)
+    registrar.pose[0, knee] = body.high[knee] - 0.1
+    registrar.pose[0, :6] += 1.0
+    step(tracker, 0.1)
+    step(tracker, 0.2)
+    moved = registrar.pose + CONFIG.velocity * (registrar.pose - standing(body))
+    assert moved[0, knee] > body.high[knee] + 1
+    moved[0, knee] = body.high[knee]
+    assert_close(registrar.starts[:1], moved)
+
+
 def test_a_lost_person_is_remembered_for_a_while_and_then_forgotten(scripted, step):
     tracker, registrar, starter = scripted
     step(tracker, 0.0)
@@ -466,6 +499,7 @@ def test_limbs_that_are_sought_soon_anyway_are_sought_with_somebody_elses(body, 
         ({"accept_misfit": -1.0}, "accept_misfit must be positive, got -1.0"),
         ({"aside": 0.0}, "aside must be positive, got 0.0"),
         ({"doubt": 0.0}, "doubt must be positive, got 0.0"),
+        ({"jump": 0.0}, "jump must be positive, got 0.0"),
         ({"profile": 1.5}, "profile must be a sine between 0 and 1, got 1.5"),
     ],
 )

@@ -18,6 +18,7 @@ from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.occlusion import OcclusionConfig
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.size import stack_observations
+from torchpose.registration.solid import SolidConfig
 from torchpose.registration.vem import (
     Distance,
     Observation,
@@ -149,7 +150,8 @@ def test_the_score_is_the_energy_of_points_rims_prior_and_limits():
     pose = standing(body, yaw=0.2)
     view = see(body, pose, num=120)
     alone = LabellingConfig(sweeps=0, potts=0.0)
-    config = RegistrationConfig(labelling=alone, rest_sd=0.0, effective_points=60.0)
+    solid = SolidConfig(sd=0.0)
+    config = RegistrationConfig(labelling=alone, rest_sd=0.0, effective_points=60.0, solid=solid)
     registrar, observation, size = Registrar(body, config), view.observation(), body.default_size(1)
     prior = PosePrior(pose + 0.01, torch.full_like(pose, 4.0))
     scores = []

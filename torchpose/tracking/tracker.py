@@ -185,7 +185,7 @@ class Tracker(nn.Module):
             return None
         elapsed = max(time_s - self._time, 1e-3)
         predicted = self._pose
-        if self._velocity is not None:
+        if self._velocity is not None and self.config.velocity > 0:
             predicted = self._pose + self.config.velocity * elapsed * self._velocity
             joints = predicted[:, 6:].clamp(self.body.low[6:], self.body.high[6:])
             predicted = torch.cat([predicted[:, :6], joints], 1)
@@ -300,6 +300,7 @@ class Tracker(nn.Module):
             return TrackedFrame(TrackStatus.lost, None)
         self._remember(found, person.time_s)
         if self._velocity is not None:
+            # The way from a wrong place to the right one is no motion, and to go on with it leads far away.
             jumped = (found.pose - followed).abs() > self.config.jump
             jumped[:, :6] = False
             self._velocity = torch.where(jumped, 0.0, self._velocity)
