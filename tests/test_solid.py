@@ -30,14 +30,14 @@ def folded(yaw: float = 0.0) -> torch.Tensor:
 
 
 def inside(posed) -> torch.Tensor:
-    middles = posed.centers[:, LIMBS.flatten()]
+    middles = posed.centers[:, LIMBS]
     return solid_residual(core_of(posed, LIMBS), middles, CONFIG)
 
 
 def test_limbs_and_core_share_the_body():
-    names = [{BODY.segment_names[k] for k in own} for own in LIMBS.tolist()]
-    arm, leg = ("upper_arm", "forearm", "hand"), ("thigh", "shank", "foot")
-    assert names == [{f"{part}_{side}" for part in limb} for limb in (arm, leg) for side in ("left", "right")]
+    kinds = ("upper_arm", "forearm", "hand", "thigh", "shank", "foot")
+    names = {f"{kind}_{side}" for kind in kinds for side in ("left", "right")}
+    assert {BODY.segment_names[k] for k in LIMBS.tolist()} == names
     core, posed = core_of(BODY(standing(BODY), SIZE), LIMBS), BODY(standing(BODY), SIZE)
     for k, name in enumerate(("torso", "head")):
         assert torch.equal(core.centers[:, k], posed.centers[:, BODY.segment_names.index(name)])
@@ -69,7 +69,7 @@ def test_rows_are_the_residuals_and_push_the_shortest_way_out():
     assert_close(rows.residual(posed), residual.flatten(1))
     # Half their squares fall along each middle's way as finite differences say.
     force = (rows.residual(posed)[..., None] * rows.direction).unflatten(1, residual.shape[1:]).sum(1)
-    core, middles = core_of(posed, LIMBS), posed.centers[:, LIMBS.flatten()]
+    core, middles = core_of(posed, LIMBS), posed.centers[:, LIMBS]
     for axis in range(3):
         step = 1e-5 * torch.eye(3, dtype=torch.float64)[axis]
         loss = [solid_residual(core, middles + s * step, CONFIG).square().sum(1) for s in (1, -1)]

@@ -130,7 +130,7 @@ class LimbSearch(nn.Module):
             total = total + (rest[:, None] - most).clamp_min_(LEAST).exp_()
             bounds.append(((most + total.log_()) * mask).sum(3))
         score = (share * torch.cat(bounds, 1)).transpose(1, 2)
-        return score - self._beside_points(observation, pose, size, limbs, places)
+        return score - self._cost_beside_points(observation, pose, size, limbs, places)
 
     def pairs(self) -> Int[Tensor, "pairs 2"]:
         """Each limb and the one of its other side."""
@@ -171,10 +171,8 @@ class LimbSearch(nn.Module):
         count = observation.cloud.mask.sum(1).clamp_min(1)
         bound = ((total + most[:, None, None, None]) * observation.cloud.mask[:, None, None, None]).sum(4)
         score = bound * (config.effective_points / count).clamp_max(1)[:, None, None, None]
-        left, right = self._beside_points(observation, pose, size, limbs, places)[:, self.pairs()].permute(
-            2, 0, 1, 3
-        )
-        return score - left[..., None] - right[:, :, None]
+        cost = self._cost_beside_points(observation, pose, size, limbs, places)[:, self.pairs()]
+        return score - cost[:, :, 0, :, None] - cost[:, :, 1, None]
 
     def _moved(
         self, pose: Tensor, places: Float[Tensor, "batch limbs candidates 4"], size: Tensor
@@ -190,7 +188,7 @@ class LimbSearch(nn.Module):
         sizes = size.expand(B, -1).repeat_interleave(C, 0)
         return _only(self.body(moved.flatten(0, 1), sizes), parts.flatten(), B), parts
 
-    def _beside_points(
+    def _cost_beside_points(
         self, observation: Observation, pose: Tensor, size: Tensor, limbs: PosedBody, places: Tensor
     ) -> Float[Tensor, "batch limbs candidates"]:
         """What its rims cost each limb in each place, and what of it runs through trunk or head, nats."""

@@ -31,16 +31,16 @@ def limb_roots(body: BodyModel) -> list[int]:
     return [k for k, parent in enumerate(body.parents, 1) if parent == 0 and k in body.parents]
 
 
-def limb_parts(body: BodyModel) -> Int[Tensor, "limbs own"]:
-    """The parts of each limb: all that its first joint moves."""
-    moved = body.part_moves[:, [6 + 2 * (k - 1) for k in limb_roots(body)]].T
-    return torch.stack([own.nonzero()[:, 0] for own in moved])
+def limb_parts(body: BodyModel) -> Int[Tensor, " own"]:
+    """The parts of all limbs: what their first joints move."""
+    first = [6 + 2 * (k - 1) for k in limb_roots(body)]
+    return body.part_moves[:, first].any(1).nonzero()[:, 0]
 
 
-def core_of(posed: PosedBody, limbs: Int[Tensor, "limbs own"]) -> PosedBody:
+def core_of(posed: PosedBody, limbs: Int[Tensor, " own"]) -> PosedBody:
     """Trunk and head: the ellipsoids that are of no limb."""
     every = torch.ones(posed.centers.shape[1], dtype=torch.bool, device=limbs.device)
-    core = every.index_fill(0, limbs.flatten(), False)
+    core = every.index_fill(0, limbs, False)
     return replace(posed, **{name: getattr(posed, name)[:, core] for name in ("centers", "frames", "radii")})
 
 
@@ -51,15 +51,14 @@ def solid_residual(
     return _too_deep(foot_point(core, middles, False, FEW_STEPS), config)
 
 
-def solid_rows(posed: PosedBody, limbs: Int[Tensor, "limbs own"], config: SolidConfig) -> Rows:
+def solid_rows(posed: PosedBody, limbs: Int[Tensor, " own"], config: SolidConfig) -> Rows:
     """Rows of these residuals: each middle is drawn out by the shortest way; empty ones where it is not too deep."""
-    parts, core = limbs.flatten(), core_of(posed, limbs)
-    middles = posed.centers[:, parts]
-    foot = foot_point(core, middles, False, FEW_STEPS)
+    core = core_of(posed, limbs)
+    foot = foot_point(core, posed.centers[:, limbs], False, FEW_STEPS)
     normal = (core.frames[:, :, None] @ foot.normal[..., None])[..., 0]
     surface = (core.frames[:, :, None] @ foot.local[..., None])[..., 0] + core.centers[:, :, None]
     inside = (_too_deep(foot, config) > 0)[..., None]
-    part = parts.expand(*normal.shape[:2], -1)
+    part = limbs.expand(*normal.shape[:2], -1)
     return Rows(
         part.flatten(1),
         torch.zeros_like(normal).flatten(1, 2),

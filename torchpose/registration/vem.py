@@ -247,7 +247,7 @@ def compiling_works(device: str) -> bool:
 class Registrar(nn.Module):
     """Fits a body to observations from given starts. Everything it knows of a person comes as arguments."""
 
-    limbs: Tensor  # (limbs, own) parts of each
+    limbs: Tensor  # (own,) the parts of all limbs
 
     def __init__(self, body: BodyModel, config: RegistrationConfig = RegistrationConfig()):
         super().__init__()
@@ -531,7 +531,7 @@ class Registrar(nn.Module):
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
         others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
         if config.solid.sd > 0:
-            middles = posed.centers[:, self.limbs.flatten()]
+            middles = posed.centers[:, self.limbs]
             inside = solid_residual(core_of(posed, self.limbs), middles, config.solid)
             others = others + 0.5 * inside.square().sum((1, 2))
         score = others - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
