@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from synthetic_cloud import RELAXED, see, standing
+from synthetic_cloud import CAMERA, RELAXED, see, standing
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
+from torchpose.pipeline import StereoToPose
 from torchpose.registration.fitting import PosePrior
 from torchpose.registration.size import (
     JointProblem,
@@ -98,3 +99,19 @@ def test_residuals_alone_are_those_with_the_jacobian():
     residual, _ = problem.linearize(unknowns)
     assert residual.square().sum() > 100
     assert_close(problem.residual(unknowns), residual, atol=1e-3, rtol=1e-4)
+
+
+def test_sizes_fitted_while_following_count_as_sizes(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr("torchpose.eyes.time.process_time", lambda: now[0])
+
+    def slow(registrar, observation, pose, size, config):
+        now[0] += 2.0
+        return size, pose
+
+    monkeypatch.setattr("torchpose.pipeline.fit_size", slow)
+    model, pose = StereoToPose(CAMERA), standing(BODY)
+    with model.stopwatch.measure("registration"):
+        model.fit_size([see(BODY, pose).observation()], pose)
+        now[0] += 1.0
+    assert dict(model.stopwatch.seconds) == {"size": 2.0, "registration": 1.0}
