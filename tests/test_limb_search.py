@@ -175,9 +175,9 @@ def test_a_pair_of_limbs_is_judged_as_the_whole_body_with_them(noise, outlier):
         rims = silhouette_residual(posed, one.nearest, one.camera, config.rim)
         return weight * labels.logsumexp(0)[there].sum() - 0.5 * (rims**2).sum()
 
-    assert search.pairs().tolist() == [[0, 1], [2, 3]]
+    assert search.pairs.tolist() == [[0, 1], [2, 3]]
     for frame in range(2):
-        for pair, limbs in enumerate(search.pairs().tolist()):
+        for pair, limbs in enumerate(search.pairs.tolist()):
             whole = torch.zeros(3, 3, dtype=torch.float64)
             for i in range(3):
                 for j in range(3):

@@ -12,12 +12,12 @@ from torchpose.registration.fitting import PosePrior
 from torchpose.registration.limb_score import LimbScore
 from torchpose.registration.limb_search import LimbSearch
 from torchpose.registration.occlusion import OcclusionConfig
-from torchpose.registration.solid import SolidConfig, core_of, limb_parts, solid_residual, solid_rows
+from torchpose.registration.solid import SolidConfig, parts_of, solid_residual, solid_rows
 from torchpose.registration.vem import Registrar, RegistrationConfig
 
 BODY = BodyModel().double()
 SIZE = BODY.default_size(1)
-LIMBS = limb_parts(BODY)
+LIMBS, CORE = Registrar(BODY).limb_parts, Registrar(BODY).core_parts
 CONFIG = SolidConfig()
 
 
@@ -31,22 +31,22 @@ def folded(yaw: float = 0.0) -> torch.Tensor:
 
 def inside(posed) -> torch.Tensor:
     middles = posed.centers[:, LIMBS]
-    return solid_residual(core_of(posed, LIMBS), middles, CONFIG)
+    return solid_residual(parts_of(posed, CORE), middles, CONFIG)
 
 
 def test_limbs_and_core_share_the_body():
     kinds = ("upper_arm", "forearm", "hand", "thigh", "shank", "foot")
     names = {f"{kind}_{side}" for kind in kinds for side in ("left", "right")}
     assert {BODY.segment_names[k] for k in LIMBS.tolist()} == names
-    core, posed = core_of(BODY(standing(BODY), SIZE), LIMBS), BODY(standing(BODY), SIZE)
-    for k, name in enumerate(("torso", "head")):
-        assert torch.equal(core.centers[:, k], posed.centers[:, BODY.segment_names.index(name)])
-    assert core.radii.shape[1] == 2
+    assert {BODY.segment_names[k] for k in CORE.tolist()} == {"torso", "head"}
+    posed = BODY(standing(BODY), SIZE)
+    for name in ("centers", "frames", "radii"):
+        assert torch.equal(getattr(parts_of(posed, CORE), name), getattr(posed, name)[:, CORE])
 
 
 def test_depths_are_those_to_the_nearest_of_many_points_of_the_surface():
     torch.manual_seed(0)
-    posed = core_of(BODY(standing(BODY, yaw=0.3), SIZE), LIMBS)
+    posed = parts_of(BODY(standing(BODY, yaw=0.3), SIZE), CORE)
     ball = torch.nn.functional.normalize(torch.randn(200_000, 3, dtype=torch.float64), dim=1)
     inner = 0.9 * torch.rand(30, 1, dtype=torch.float64) * ball[:30]
     for k in range(2):
@@ -64,12 +64,12 @@ def test_depths_are_those_to_the_nearest_of_many_points_of_the_surface():
 
 def test_rows_are_the_residuals_and_push_the_shortest_way_out():
     posed = BODY(folded(), SIZE)
-    rows, residual = solid_rows(posed, LIMBS, CONFIG), inside(posed)
+    rows, residual = solid_rows(posed, LIMBS, CORE, CONFIG), inside(posed)
     assert (residual[0, 0] > 3).sum() == 1  # the forearm's middle, in the trunk
     assert_close(rows.residual(posed), residual.flatten(1))
     # Half their squares fall along each middle's way as finite differences say.
     force = (rows.residual(posed)[..., None] * rows.direction).unflatten(1, residual.shape[1:]).sum(1)
-    core, middles = core_of(posed, LIMBS), posed.centers[:, LIMBS]
+    core, middles = parts_of(posed, CORE), posed.centers[:, LIMBS]
     for axis in range(3):
         step = 1e-5 * torch.eye(3, dtype=torch.float64)[axis]
         loss = [solid_residual(core, middles + s * step, CONFIG).square().sum(1) for s in (1, -1)]
@@ -79,12 +79,12 @@ def test_rows_are_the_residuals_and_push_the_shortest_way_out():
 def test_several_bodies_are_judged_as_each_alone():
     pose = torch.cat([folded(), standing(BODY), folded(0.5)])
     size = 1 + 0.05 * torch.randn(3, len(BODY.size_names), dtype=torch.float64)
-    whole, rows = inside(BODY(pose, size)), solid_rows(BODY(pose, size), LIMBS, CONFIG)
+    whole, rows = inside(BODY(pose, size)), solid_rows(BODY(pose, size), LIMBS, CORE, CONFIG)
     assert (whole.flatten(1).amax(1) > 1).tolist() == [True, False, True]
     for b in range(3):
         one = BODY(pose[b : b + 1], size[b : b + 1])
         assert_close(whole[b], inside(one)[0])
-        assert_close(rows.direction[b], solid_rows(one, LIMBS, CONFIG).direction[0])
+        assert_close(rows.direction[b], solid_rows(one, LIMBS, CORE, CONFIG).direction[0])
 
 
 def test_a_pose_costs_half_the_squares_and_a_fit_comes_out():

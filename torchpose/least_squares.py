@@ -71,12 +71,12 @@ def levenberg_marquardt(
         start: first guess, a problem a row.
         residual: r alone, if it takes less time.
     """
+    loss = None if residual is None else _half_squares(residual)
+    return minimize(normal_equations(linearize), start, config, loss=loss)
 
-    def loss(x: Tensor) -> Tensor:
-        assert residual is not None
-        return 0.5 * residual(x).square().sum(1)
 
-    return minimize(normal_equations(linearize), start, config, loss=None if residual is None else loss)
+def _half_squares(residual: Residual) -> Loss:
+    return lambda x: 0.5 * residual(x).square().sum(1)
 
 
 def minimize(

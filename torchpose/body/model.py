@@ -290,6 +290,12 @@ class BodyModel(nn.Module):
         """Which parameters move which ellipsoid."""
         return self.moves.index_select(0, self.carriers[: self.num_parts])
 
+    @property
+    def limb_starts(self) -> list[int]:
+        """Of each limb the first of its parameters. A limb is a body on the root that others hang from, and these."""
+        roots = [k for k, parent in enumerate(self.parents, 1) if parent == 0 and k in self.parents]
+        return [6 + 2 * (k - 1) for k in roots]
+
     def pose_from_directions(
         self,
         translation: Float[Tensor, "batch 3"],

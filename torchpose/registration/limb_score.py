@@ -16,7 +16,7 @@ from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.limb_search import LEAST, LimbSearch
 from torchpose.registration.occlusion import OcclusionConfig, behind, entries
 from torchpose.registration.silhouette import silhouette_residual
-from torchpose.registration.solid import core_of, solid_residual
+from torchpose.registration.solid import parts_of, solid_residual
 from torchpose.registration.start import picked
 from torchpose.registration.vem import Distance, Observation, Registrar, nearest_parts
 
@@ -41,18 +41,14 @@ class KnownBody:
 class LimbScore(nn.Module):
     """Judges poses that differ from their frame's in one limb alone."""
 
-    parts: Tensor  # (limbs, own) of each limb
+    limbs: Tensor  # as the search has them
+    parts: Tensor
 
     def __init__(self, search: LimbSearch, occlusion: OcclusionConfig):
         super().__init__()
-        self.body, self.limbs, self.registrar, self.occlusion = (
-            search.body,
-            search.limbs,
-            search.registrar,
-            occlusion,
-        )
-        parts = torch.stack([own.nonzero()[:, 0] for own in search.own])
-        self.register_buffer("parts", parts, persistent=False)
+        self.body, self.registrar, self.occlusion = search.body, search.registrar, occlusion
+        self.register_buffer("limbs", search.limbs, persistent=False)
+        self.register_buffer("parts", search.parts, persistent=False)
 
     @staticmethod
     def serves(registrar: Registrar) -> bool:
@@ -151,7 +147,8 @@ class LimbScore(nn.Module):
         if config.rim.weight > 0:
             score = score + 0.5 * (known.rims[frame, limb] + self._rims(posed, observation).sum(1))
         if config.solid.sd > 0:
-            inside = solid_residual(core_of(whole, self.registrar.limbs), posed.centers, config.solid)
+            trunk = parts_of(whole, self.registrar.core_parts)
+            inside = solid_residual(trunk, posed.centers, config.solid)
             score = score + 0.5 * inside.square().sum((1, 2))
         nothing = PosePrior(pose, torch.zeros_like(pose))
         seen = (best > none) & cloud.mask[:, None]

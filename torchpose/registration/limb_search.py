@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchpose.body.ellipsoid import FEW_STEPS, foot_point, rough_square
 from torchpose.body.model import BodyModel, PosedBody
 from torchpose.registration.silhouette import silhouette_residual
-from torchpose.registration.solid import core_of, limb_roots, solid_residual
+from torchpose.registration.solid import parts_of, solid_residual
 from torchpose.registration.vem import Observation, Registrar
 
 # Of a limb: of its first joint, and of the one after it.
@@ -49,23 +49,29 @@ class LimbSearch(nn.Module):
     limbs: Tensor  # (limbs, 4) parameters of each
     places: Tensor  # (limbs, candidates, 4) rad
     own: Tensor  # (limbs, parts) bool: parts that the limb's first parameter moves
+    parts: Tensor  # (limbs, own) these parts' numbers
     beside: Tensor  # (limbs,) the limb of the other side; -1 where there is none
+    pairs: Tensor  # (pairs, 2) each limb and the one of its other side
 
     def __init__(self, body: BodyModel, registrar: Registrar, config: LimbSearchConfig = LimbSearchConfig()):
         super().__init__()
         self.body, self.registrar, self.config = body, registrar, config
-        first = torch.tensor([6 + 2 * (k - 1) for k in limb_roots(body)])
+        first = torch.tensor(body.limb_starts)
         limbs = first[:, None] + torch.arange(PARAMETERS)
         even = torch.quasirandom.SobolEngine(PARAMETERS, scramble=True, seed=0).draw(config.candidates)
         low, high = body.low[limbs][:, None], body.high[limbs][:, None]
         self.register_buffer("limbs", limbs, persistent=False)
         self.register_buffer("places", low + even.to(low) * (high - low), persistent=False)
         self.register_buffer("own", body.part_moves[:, first].T, persistent=False)
+        parts = torch.stack([own.nonzero()[:, 0] for own in self.own])
+        self.register_buffer("parts", parts, persistent=False)
         names = [_unsided(body.parameter_names[k]) for k in first.tolist()]
         beside = [
             next((n for n, b in enumerate(names) if n != k and a == b), -1) for k, a in enumerate(names)
         ]
         self.register_buffer("beside", torch.tensor(beside), persistent=False)
+        pairs = [(k, other) for k, other in enumerate(beside) if other > k]
+        self.register_buffer("pairs", torch.tensor(pairs, dtype=torch.long).view(-1, 2), persistent=False)
 
     def forward(
         self,
@@ -104,7 +110,7 @@ class LimbSearch(nn.Module):
         exact: bool,
     ) -> Float[Tensor, "batch limbs candidates"]:
         """Log-density of the points and of the rims, up to a constant for each limb."""
-        limbs, parts = self._moved(pose, places, size)
+        limbs, parts = self._moved(pose, places, size), self.parts
         # To first order every other point will do; the few best are judged by all of them.
         step, registrar = 1 if exact else 2, self.registrar
         points, mask = observation.cloud.points[:, ::step], observation.cloud.mask[:, None, None, ::step]
@@ -132,11 +138,6 @@ class LimbSearch(nn.Module):
         score = (share * torch.cat(bounds, 1)).transpose(1, 2)
         return score - self._cost_beside_points(observation, pose, size, limbs, places)
 
-    def pairs(self) -> Int[Tensor, "pairs 2"]:
-        """Each limb and the one of its other side."""
-        first = torch.arange(len(self.beside), device=self.beside.device)
-        return torch.stack([first, self.beside], 1)[self.beside > first]
-
     def score_pairs(
         self,
         observation: Observation,
@@ -150,7 +151,7 @@ class LimbSearch(nn.Module):
         hides what: for all combinations of places only these three sums are added anew.
         """
         registrar, config, points = self.registrar, self.registrar.config, observation.cloud.points
-        limbs, parts = self._moved(pose, places, size)
+        limbs, parts = self._moved(pose, places, size), self.parts
 
         def square(posed: PosedBody) -> Tensor:
             return rough_square(registrar.pressed(posed, observation)[0], points, config.visible)
@@ -163,30 +164,29 @@ class LimbSearch(nn.Module):
         none = torch.full_like(still[:, :1], -0.5 * config.outlier**2 if config.outlier > 0 else -torch.inf)
         most = torch.maximum(torch.cat([still, none], 1).amax(1), moved.flatten(1, 3).amax(1))
         limb = (moved - most[:, None, None, None]).clamp_min_(LEAST).exp_().sum(3)  # (B, C, L, N)
-        left, right = limb[:, :, self.pairs()].permute(3, 0, 2, 1, 4)  # (B, pairs, C, N) each
-        others = ~self.own[self.pairs()].any(1)  # (pairs, parts)
+        left, right = limb[:, :, self.pairs].permute(3, 0, 2, 1, 4)  # (B, pairs, C, N) each
+        others = ~self.own[self.pairs].any(1)  # (pairs, parts)
         rest = others.to(still) @ (still - most[:, None]).clamp_min_(LEAST).exp_()
         rest = rest + (none - most[:, None]).clamp_min_(LEAST).exp_()
         total = (left[:, :, :, None] + right[:, :, None] + rest[:, :, None, None]).log_()
         count = observation.cloud.mask.sum(1).clamp_min(1)
         bound = ((total + most[:, None, None, None]) * observation.cloud.mask[:, None, None, None]).sum(4)
         score = bound * (config.effective_points / count).clamp_max(1)[:, None, None, None]
-        cost = self._cost_beside_points(observation, pose, size, limbs, places)[:, self.pairs()]
+        cost = self._cost_beside_points(observation, pose, size, limbs, places)[:, self.pairs]
         return score - cost[:, :, 0, :, None] - cost[:, :, 1, None]
 
     def _moved(
         self, pose: Tensor, places: Float[Tensor, "batch limbs candidates 4"], size: Tensor
-    ) -> tuple[PosedBody, Int[Tensor, "limbs own"]]:
-        """The limbs' ellipsoids in all places, as those of one body of each frame, candidates first; and their parts.
+    ) -> PosedBody:
+        """The limbs' ellipsoids in all places, as those of one body of each frame, candidates first.
 
         They hang on the root and on their own parameters alone: all limbs are moved at once.
         """
         B, C = len(pose), places.shape[2]
-        parts = torch.stack([own.nonzero()[:, 0] for own in self.own])
         moved = pose[:, None].repeat(1, C, 1)
         moved[:, :, self.limbs] = places.transpose(1, 2)
         sizes = size.expand(B, -1).repeat_interleave(C, 0)
-        return _only(self.body(moved.flatten(0, 1), sizes), parts.flatten(), B), parts
+        return _only(self.body(moved.flatten(0, 1), sizes), self.parts.flatten(), B)
 
     def _cost_beside_points(
         self, observation: Observation, pose: Tensor, size: Tensor, limbs: PosedBody, places: Tensor
@@ -200,8 +200,8 @@ class LimbSearch(nn.Module):
             )
             cost = cost + 0.5 * residual.square().unflatten(1, shape).sum(3).transpose(1, 2)
         if config.solid.sd > 0:
-            core = core_of(self.body(pose, size), self.registrar.limbs)
-            inside = solid_residual(core, limbs.centers, config.solid).square().sum(1)
+            trunk = parts_of(self.body(pose, size), self.registrar.core_parts)
+            inside = solid_residual(trunk, limbs.centers, config.solid).square().sum(1)
             cost = cost + 0.5 * inside.unflatten(1, shape).sum(3).transpose(1, 2)
         return cost
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.body.ellipsoid import FEW_STEPS, FootPoint, foot_point
-from torchpose.body.model import BodyModel, PosedBody
+from torchpose.body.ellipsoid import FEW_STEPS, FootPoint, foot_point, to_camera
+from torchpose.body.model import PosedBody
 from torchpose.registration.fitting import Rows
 
 
@@ -26,37 +26,30 @@ class SolidConfig:
             raise ValueError(f"sd and margin must not be negative, got {self}; sd=0 switches the term off")
 
 
-def limb_roots(body: BodyModel) -> list[int]:
-    """The first body of each limb, numbered from 1: one on the root that others hang from."""
-    return [k for k, parent in enumerate(body.parents, 1) if parent == 0 and k in body.parents]
-
-
-def limb_parts(body: BodyModel) -> Int[Tensor, " own"]:
-    """The parts of all limbs: what their first joints move."""
-    first = [6 + 2 * (k - 1) for k in limb_roots(body)]
-    return body.part_moves[:, first].any(1).nonzero()[:, 0]
-
-
-def core_of(posed: PosedBody, limbs: Int[Tensor, " own"]) -> PosedBody:
-    """Trunk and head: the ellipsoids that are of no limb."""
-    every = torch.ones(posed.centers.shape[1], dtype=torch.bool, device=limbs.device)
-    core = every.index_fill(0, limbs, False)
-    return replace(posed, **{name: getattr(posed, name)[:, core] for name in ("centers", "frames", "radii")})
+def parts_of(posed: PosedBody, parts: Int[Tensor, " some"]) -> PosedBody:
+    """Some ellipsoids of bodies."""
+    return replace(posed, **{name: getattr(posed, name)[:, parts] for name in ("centers", "frames", "radii")})
 
 
 def solid_residual(
-    core: PosedBody, middles: Float[Tensor, "batch middles 3"], config: SolidConfig
+    trunk: PosedBody, middles: Float[Tensor, "batch middles 3"], config: SolidConfig
 ) -> Float[Tensor, "batch core middles"]:
-    """How far middles of limbs lie too deep below each surface, no unit."""
-    return _too_deep(foot_point(core, middles, False, FEW_STEPS), config)
+    """How far middles of limbs lie too deep below the surfaces of trunk and head, no unit."""
+    return _too_deep(foot_point(trunk, middles, False, FEW_STEPS), config)
 
 
-def solid_rows(posed: PosedBody, limbs: Int[Tensor, " own"], config: SolidConfig) -> Rows:
-    """Rows of these residuals: each middle is drawn out by the shortest way; empty ones where it is not too deep."""
-    core = core_of(posed, limbs)
-    foot = foot_point(core, posed.centers[:, limbs], False, FEW_STEPS)
-    normal = (core.frames[:, :, None] @ foot.normal[..., None])[..., 0]
-    surface = (core.frames[:, :, None] @ foot.local[..., None])[..., 0] + core.centers[:, :, None]
+def solid_rows(
+    posed: PosedBody, limbs: Int[Tensor, " own"], core: Int[Tensor, " others"], config: SolidConfig
+) -> Rows:
+    """Rows of these residuals: each middle is drawn out by the shortest way; empty ones where it is not too deep.
+
+    Args:
+        limbs: the parts of all limbs.
+        core: all others, trunk and head.
+    """
+    trunk = parts_of(posed, core)
+    foot = foot_point(trunk, posed.centers[:, limbs], False, FEW_STEPS)
+    normal, surface = foot.normal @ trunk.frames.mT, to_camera(trunk, foot.local)
     inside = (_too_deep(foot, config) > 0)[..., None]
     part = limbs.expand(*normal.shape[:2], -1)
     return Rows(

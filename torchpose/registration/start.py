@@ -241,7 +241,7 @@ class Starter(nn.Module):
         if prior is not None:
             mean, precision = (x[:, search.limbs][:, :, None] for x in (prior.mean, prior.precision))
             cost = 0.5 * (precision * (places - mean).square()).sum(3)
-        left, right = search.pairs().unbind(1)
+        left, right = search.pairs.unbind(1)
         new = fresh[:, left, :, None] & fresh[:, right, None]  # (B, pairs, H, H)
         new[..., 0, 0] = False
         rank = likely - cost[:, left, :, None] - cost[:, right, None]

@@ -36,7 +36,7 @@ from torchpose.registration.fitting import (
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
 from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
 from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_residual, silhouette_rows
-from torchpose.registration.solid import SolidConfig, core_of, limb_parts, solid_residual, solid_rows
+from torchpose.registration.solid import SolidConfig, parts_of, solid_residual, solid_rows
 from torchpose.vision.camera import StereoCamera
 from torchpose.vision.points import PointCloud
 
@@ -247,13 +247,16 @@ def compiling_works(device: str) -> bool:
 class Registrar(nn.Module):
     """Fits a body to observations from given starts. Everything it knows of a person comes as arguments."""
 
-    limbs: Tensor  # (own,) the parts of all limbs
+    limb_parts: Tensor  # (own,) those of all limbs
+    core_parts: Tensor  # (others,) trunk and head
 
     def __init__(self, body: BodyModel, config: RegistrationConfig = RegistrationConfig()):
         super().__init__()
         self.body = body
         self.config = config
-        self.register_buffer("limbs", limb_parts(body), persistent=False)
+        moved = body.part_moves[:, body.limb_starts].any(1)
+        self.register_buffer("limb_parts", moved.nonzero()[:, 0], persistent=False)
+        self.register_buffer("core_parts", (~moved).nonzero()[:, 0], persistent=False)
         if config.compile and compiling_works(body.axes.device.type):
             for stage in STAGES:
                 setattr(self, stage, torch.compile(getattr(self, stage)))
@@ -395,7 +398,7 @@ class Registrar(nn.Module):
                 )
             )
         if rim and self.config.solid.sd > 0:
-            others.append(solid_rows(posed, self.limbs, self.config.solid))
+            others.append(solid_rows(posed, self.limb_parts, self.core_parts, self.config.solid))
         if others:
             rows = Rows.cat(rows, reduce(Rows.cat, others))
         return rows, self._support(posed, answer, observation.cloud)
@@ -531,8 +534,8 @@ class Registrar(nn.Module):
         terms, _ = pose_terms(self.body, pose, full, config.fitting)
         others = 0.5 * (rims.square().sum(1) + terms.square().sum((1, 2)))
         if config.solid.sd > 0:
-            middles = posed.centers[:, self.limbs]
-            inside = solid_residual(core_of(posed, self.limbs), middles, config.solid)
+            trunk, middles = parts_of(posed, self.core_parts), posed.centers[:, self.limb_parts]
+            inside = solid_residual(trunk, middles, config.solid)
             others = others + 0.5 * inside.square().sum((1, 2))
         score = others - labelling.bound[-1] * (config.effective_points / count).clamp_max(1)
         misfit = fit.clamp_max(0.2).sum(1) / count
