@@ -67,8 +67,10 @@ def test_a_frame_that_is_not_a_number_harms_no_other(scene):
     found, more = run(model, replace(observation, cloud=replace(observation.cloud, points=points)), wrong)
     assert found.isfinite().all()
     assert more.isfinite().all()
-    # Two frames' places lead to an elbow that is turned by 8 cm beside wrist and shoulder that are right.
-    assert worst_joint(body, fitted(model, observation, found), pose)[1:].max() < 0.09
+    # It goes where its neighbours are, and does not hold them where it was.
+    assert worst_joint(body, fitted(model, observation, found), pose).max() < 0.06
+    without, _ = run(model, observation, wrong)
+    assert_close(found, without, atol=0.2, rtol=0)
 
 
 def test_the_best_of_a_table_differ_and_the_first_stays():

@@ -6,6 +6,7 @@ legs are nearly independent given the trunk, so each limb has a chain of its own
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -174,6 +175,13 @@ class _Work:
     size: Float[Tensor, "frames sizes"]
     rest_share: float
 
+    @cached_property
+    def blind(self) -> Bool[Tensor, " frames"]:
+        """Frames of broken points: to them all places are alike, or they would hold their neighbours where they are."""
+        cloud = self.observation.cloud
+        broken = cloud.points.isnan().any(2) | self.observation.potential.isnan().any(2)
+        return (broken & cloud.mask).any(1)
+
     @property
     def limbs(self) -> Int[Tensor, "limbs 4"]:
         return self.of.search.limbs
@@ -181,7 +189,7 @@ class _Work:
     def start(self, pose: Float[Tensor, "frames parameters"]) -> Table:
         """The believed places alone."""
         T, L = len(pose), len(self.of.search.limbs)
-        cost = self.nats(torch.arange(T, device=pose.device), pose)
+        cost = torch.where(self.blind, 0.0, self.nats(torch.arange(T, device=pose.device), pose))
         return Table(pose[:, self.of.search.limbs][:, :, None], cost[:, None, None].expand(-1, L, -1).clone())
 
     def nats(
@@ -288,7 +296,7 @@ class _Work:
             body, row = known
             pieces = zip(row[frame].split(SCORED), limb.split(SCORED), own.split(SCORED), strict=True)
             nats = torch.cat([self.of.score(body, *piece, self.rest_share) for piece in pieces])
-        cost[frame, limb, slot] = nats.nan_to_num(nan=torch.inf)
+        cost[frame, limb, slot] = torch.where(self.blind[frame], 0.0, nats.nan_to_num(nan=torch.inf))
         return cost
 
     def _fit(self, frame: Tensor, limb: Tensor, start: Tensor) -> Tensor:
