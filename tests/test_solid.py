@@ -13,7 +13,9 @@ from torchpose.registration.limb_score import LimbScore
 from torchpose.registration.limb_search import LimbSearch
 from torchpose.registration.occlusion import OcclusionConfig
 from torchpose.registration.solid import SolidConfig, parts_of, solid_residual, solid_rows
-from torchpose.registration.vem import Registrar, RegistrationConfig
+from torchpose.registration.vem import Registrar, RegistrationConfigfrom torchpose.synthesis.company import CompanyRecording
+from torchpose.synthesis.database import synthetic_camera
+from torchpose.synthesis.scenario import behind_counter, crossing
 
 BODY = BodyModel().double()
 SIZE = BODY.default_size(1)
@@ -42,6 +44,13 @@ def test_limbs_and_core_share_the_body():
     posed = BODY(standing(BODY), SIZE)
     for name in ("centers", "frames", "radii"):
         assert torch.equal(getattr(parts_of(posed, CORE), name), getattr(posed, name)[:, CORE])
+
+
+@pytest.mark.parametrize("scenario", [crossing, behind_counter], ids=["crossing", "behind a counter"])
+def test_true_poses_cost_next_to_nothing(scenario):
+    for seed in range(10):
+        for posed in CompanyRecording(scenario(seed), synthetic_camera(480, 360, 10.0)).posed(0, 200):
+            assert 0.5 * inside(posed).square().sum((1, 2)).max() < 0.1  # nats
 
 
 def test_depths_are_those_to_the_nearest_of_many_points_of_the_surface():

@@ -19,7 +19,7 @@ class SolidConfig:
     sd: float = (
         0.01  # m that a limb's middle lies too deep, which cost as much as one sigma; 0 switches it off
     )
-    margin: float = 0.015  # m below the surface, from which that is: of synthetic people none lies deeper
+    margin: float = 0.015  # m below the surface, from which that is: true poses lie 1.8 cm deep at most
 
     def __post_init__(self) -> None:
         if self.sd < 0 or self.margin < 0:
