@@ -13,7 +13,8 @@ from torchpose.registration.limb_score import LimbScore
 from torchpose.registration.limb_search import LimbSearch
 from torchpose.registration.occlusion import OcclusionConfig
 from torchpose.registration.solid import SolidConfig, parts_of, solid_residual, solid_rows
-from torchpose.registration.vem import Registrar, RegistrationConfigfrom torchpose.synthesis.company import CompanyRecording
+from torchpose.registration.vem import Registrar, RegistrationConfig
+from torchpose.synthesis.company import CompanyRecording
 from torchpose.synthesis.database import synthetic_camera
 from torchpose.synthesis.scenario import behind_counter, crossing
 

@@ -330,14 +330,14 @@ class Registrar(nn.Module):
         config, points = self.config, observation.cloud.points
         K = self.body.num_parts
         seen, back = self.pressed(posed, observation)
-        if not config.hard:
+        if not config.hard or config.near >= K:
             part = torch.arange(K, device=points.device)[:, None].expand(len(points), K, points.shape[1])
             foot = foot_point(seen, points, config.visible)
             square = foot.residual.square().sum(-1)
         else:
             # A point's label is one of the nearest parts; those far off need no foot point to be told apart from these.
             rough = rough_square(seen, points, config.visible)
-            part = nearest_parts(rough.detach(), min(config.near, K))
+            part = nearest_parts(rough.detach(), config.near)
             foot = foot_of_part(seen, part, points, config.visible)
             square = rough.scatter(1, part, foot.residual.square().sum(-1))
         return Correspondence(part, foot, square, back)
