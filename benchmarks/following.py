@@ -87,7 +87,7 @@ LEGS = [JOINT_NAMES.index(f"{joint}_{side}") for joint in ("knee", "ankle") for 
 UPPER = [0, 1, 4, 5]
 DRAWS = 256
 TURNS = 3
-HIDDEN_STEREO = 3
+HIDDEN_STEREO = 6
 
 
 @dataclass(frozen=True)
