@@ -68,7 +68,16 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "start",
         "limb_score",
     ),
-    "tracking": ("kalman", "location", "trellis", "limb_hypothesis", "smoother", "partition", "tracker"),
+    "tracking": (
+        "kalman",
+        "location",
+        "chain",
+        "trellis",
+        "limb_hypothesis",
+        "smoother",
+        "partition",
+        "tracker",
+    ),
     "activity": (
         *("dataset", "skeleton", "subspace", "features"),
         *("inference", "baum_welch", "hmm", "codebook", "score_layer", "recognizer", "segmenter", "diary"),
