@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.body.ellipsoid import (
+    FEW_STEPS,
+    NEWTON_STEPS,
     FootPoint,
     algebraic_distance,
     flattened,
@@ -332,7 +334,7 @@ class Registrar(nn.Module):
         seen, back = self.pressed(posed, observation)
         if not config.hard or config.near >= K:
             part = torch.arange(K, device=points.device)[:, None].expand(len(points), K, points.shape[1])
-            foot = foot_point(seen, points, config.visible)
+            foot = foot_point(seen, points, config.visible, FEW_STEPS if config.hard else NEWTON_STEPS)
             square = foot.residual.square().sum(-1)
         else:
             # A point's label is one of the nearest parts; those far off need no foot point to be told apart from these.
