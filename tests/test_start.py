@@ -27,6 +27,12 @@ SIT = {
     "thigh_right": (-0.2, 0.25, -1.0),
     "shank_right": (-0.1, 1.0, 0.0),
 }
+GUARD = {
+    "upper_arm_left": (0.2, 0.9, -0.4),
+    "forearm_left": (-0.2, -0.8, -0.7),
+    "upper_arm_right": (-0.2, 0.9, -0.4),
+    "forearm_right": (0.2, -0.8, -0.7),
+}
 UP = {"upper_arm_right": (-0.4, -1.0, -0.1), "forearm_right": (-0.1, -1.0, -0.1)}
 
 
@@ -273,6 +279,10 @@ def test_a_registration_gives_one_of_its_rows(body):
     [
         ({"points": 0}, "points must be at least 1, got 0"),
         ({"finalists": 0}, "finalists must be at least 1, got 0"),
+        (
+            {"finalists_apart": -0.1},
+            "finalists_apart must not be negative, got -0.1 rad; 0 takes the best of all",
+        ),
         ({"yaws": ()}, "yaws, face_yaws and walking_yaws need at least one angle each"),
     ],
 )
@@ -355,3 +365,56 @@ def test_several_are_turned_as_each_alone(body):
     both = turned_by(body, poses, yaw, size)
     for k in (0, 1):
         assert_close(both[k : k + 1], turned_by(body, poses[k : k + 1], yaw[k : k + 1], size))
+
+
+def test_the_best_few_that_differ_are_those_taken_one_after_another(body):
+    starter = Starter(body, StartConfig(finalists=3, finalists_apart=0.2), RegistrationConfig())
+    generator = torch.Generator().manual_seed(0)
+    rank = torch.rand(5, 9, generator=generator)
+    rank[3, 2:] = torch.inf  # two poses alone have a score,
+    rank[4] = torch.inf  # and in the last frame none
+    pose = torch.zeros(5, 9, 24)
+    pose[..., 6:] = 0.3 * torch.randint(3, (5, 9, 18), generator=generator) * (torch.arange(18) == 7)
+    pose[..., :6] = torch.randn(5, 9, 6, generator=generator)  # the root tells none apart
+    best, there = starter._different(rank, pose)
+    for b in range(4):
+        taken = []
+        for k in rank[b].argsort().tolist():
+            new = all(bool((pose[b, k, 6:] - pose[b, j, 6:]).abs().max() >= 0.2) for j in taken)
+            if new and rank[b, k] < torch.inf and len(taken) < 3:
+                taken.append(k)
+        assert best[b, there[b]].tolist() == taken
+    assert there[4].tolist() == [True, False, False]
+
+
+def test_finalists_are_different_poses(body, starter, monkeypatch):
+    """What the labels of few points rank first is not the same place four times."""
+    fitted, fit = [], Starter._fit
+
+    def watched(registrar, observation, frame, starts, size, prior, rounds, sigma=None, covariance=False):
+        if covariance:
+            fitted.append(starts)
+        return fit(registrar, observation, frame, starts, size, prior, rounds, sigma, covariance)
+
+    monkeypatch.setattr(Starter, "_fit", staticmethod(watched))
+    pose = standing(body, limbs(body, **WAVE))
+    starter.refresh(see(body, pose, num=200).observation(), standing(body), body.default_size(1))
+    (finalists,) = fitted
+    gaps = (finalists[:, None, 6:] - finalists[:, 6:]).abs().amax(2)
+    assert 1 < len(finalists) <= starter.config.finalists
+    assert (gaps + torch.eye(len(gaps)) >= starter.config.finalists_apart).all()
+
+
+@pytest.mark.parametrize(
+    ("arms", "yaw"),
+    [(GUARD, 0.0), (T_POSE, 0.8), (GUARD, 1.4)],
+    ids=["guard", "arms out", "guard in profile"],
+)
+def test_a_trunk_that_leans_with_both_arms_in_wrong_places_is_put_right(body, starter, arms, yaw):
+    """By 17 degrees to the side and 11 forwards, where no limb alone has a better place; searched by limbs alone the
+    worst joint is 16 to 65 cm off."""
+    true = standing(body, limbs(body, **arms), yaw=yaw)
+    start = standing(body, yaw=yaw)
+    start[:, 4:6] += torch.tensor([0.2, 0.3])
+    found = starter.refresh(see(body, true, num=250).observation(), start, body.default_size(1))
+    assert (body(found.pose).joints - body(true).joints).norm(dim=-1).max() < 0.03

@@ -50,6 +50,7 @@ class StartConfig:
     rounds: int = 5  # of these starts
     final_rounds: int = 8  # of the best few, on all points
     finalists: int = 4
+    finalists_apart: float = 0.25  # rad by which these differ in a joint: the same one four times is only one
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
     exchanged: int = 8  # best starts whose limbs are exchanged
     apart: float = 0.03  # rad by which limbs differ that are exchanged: the others end in the same place
@@ -69,8 +70,9 @@ class StartConfig:
         for name in ("points", "rounds", "final_rounds", "finalists", "exchanged", "combined"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.apart < 0:
-            raise ValueError(f"apart must not be negative, got {self.apart}; 0 exchanges all limbs")
+        for name, all_of in (("apart", "exchanges all limbs"), ("finalists_apart", "takes the best of all")):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)} rad; 0 {all_of}")
         if not (self.yaws and self.face_yaws and self.walking_yaws):
             raise ValueError("yaws, face_yaws and walking_yaws need at least one angle each, in degrees")
         if not self.back_penalty >= 0:
@@ -79,6 +81,8 @@ class StartConfig:
 
 class Starter(nn.Module):
     """Finds the pose in one frame from a list of plausible ones."""
+
+    arms: Tensor  # (places, parameters) poses with the arms in each of `ARMS`
 
     def __init__(self, body: BodyModel, config: StartConfig, registration: RegistrationConfig):
         super().__init__()
@@ -89,6 +93,9 @@ class Starter(nn.Module):
         alone = LabellingConfig(sweeps=0, potts=0.0)
         self.coarse = Registrar(body, replace(registration, labelling=alone))
         self.limb_search = LimbSearch(body, self.coarse, config.limbs)
+        directions = torch.stack([_directions(arm, LEGS[0]) for arm in ARMS]).to(body.axes)
+        zero = directions.new_zeros(len(ARMS), 3)
+        self.register_buffer("arms", body.pose_from_directions(zero, zero, directions), persistent=False)
 
     def forward(
         self,
@@ -121,15 +128,27 @@ class Starter(nn.Module):
         prior: PosePrior | None = None,
         walking: float | None = None,
     ) -> Registration:
-        """Register frames from poses of which some limbs may be wrong: each limb is tried elsewhere too."""
+        """Register frames from poses of which some limbs may be wrong: each limb is tried elsewhere too.
+
+        An arm in a wrong place leans the trunk to where the two together find points; then neither is found alone. So
+        both arms are also tried in their common places, on a trunk that stands upright.
+        """
         few = thin(observation, self.config.points)
         limbs = self.limb_search(few, pose, size)  # (B, limbs, best, P)
         together = pose.clone()
         for k, own in enumerate(self.limb_search.limbs):
             together[:, own] = limbs[:, k, 0, own]
-        starts = torch.cat([pose[:, None], together[:, None], limbs.flatten(1, 2)], 1)
+        starts = [pose[:, None], together[:, None], limbs.flatten(1, 2), self._upright(pose)]
         sigma = self.config.refresh_sigma
-        return self._search(observation, starts, size, sigma, sigma, prior, walking)
+        return self._search(observation, torch.cat(starts, 1), size, sigma, sigma, prior, walking)
+
+    def _upright(self, pose: Float[Tensor, "batch parameters"]) -> Float[Tensor, "batch places parameters"]:
+        """The poses upright, with both arms in each of `ARMS`."""
+        upright = pose[:, None].repeat(1, len(self.arms), 1)
+        upright[..., 4:6] = 0  # pitch and roll
+        arms = self.limb_search.limbs[:2].flatten()  # as in the body file, see `_directions`
+        upright[..., arms] = self.arms[:, arms]
+        return upright
 
     def _search(
         self,
@@ -156,14 +175,33 @@ class Starter(nn.Module):
         last, every = self.registrar.config.sigma_last, new.nonzero()[:, 0]
         again = self._fit(self.coarse, few, every, combined[new], size, prior, 1, last)
         rank = torch.full_like(combined[..., 0], torch.inf).masked_scatter(new, self.score(again, walking))
-        best = rank.topk(min(self.config.finalists, S), largest=False).indices
         finalists = combined.masked_scatter(new[..., None], again.pose)
-        finalists = finalists.gather(1, best[..., None].expand(-1, -1, P)).flatten(0, 1)
-        every, rounds = row.repeat_interleave(best.shape[1]), self.config.final_rounds
+        best, other = self._different(rank, finalists)
+        every, rounds = other.nonzero()[:, 0], self.config.final_rounds
+        finalists = finalists.gather(1, best[..., None].expand(-1, -1, P))[other]
         final = self._fit(
             self.registrar, observation, every, finalists, size, prior, rounds, final_sigma, covariance=True
         )
-        return final.take(row * best.shape[1] + self.score(final, walking).view_as(best).argmin(1))
+        rank = torch.full_like(rank[:, : best.shape[1]], torch.inf).masked_scatter(
+            other, self.score(final, walking)
+        )
+        return final.take((other.flatten().cumsum(0) - 1).view_as(other)[row, rank.argmin(1)])
+
+    def _different(
+        self, rank: Float[Tensor, "batch poses"], pose: Float[Tensor, "batch poses parameters"]
+    ) -> tuple[Int[Tensor, "batch best"], Bool[Tensor, "batch best"]]:
+        """The best few poses of each frame that differ in a joint, the least rank first; and which of these exist."""
+        joints, best, there = pose[..., 6:], [], []
+        for _ in range(min(self.config.finalists, rank.shape[1])):
+            least, which = rank.min(1, keepdim=True)
+            best.append(which)
+            there.append(least < torch.inf)
+            one = joints.gather(1, which[..., None].expand(-1, -1, joints.shape[2]))
+            near = (joints - one).abs().amax(2) < self.config.finalists_apart
+            rank = torch.where(near, torch.inf, rank).scatter(1, which, torch.inf)
+        # Of a frame of no numbers one is as good as another, and one must be answered.
+        there[0] = torch.ones_like(there[0])
+        return torch.cat(best, 1), torch.cat(there, 1)
 
     @staticmethod
     def _fit(
