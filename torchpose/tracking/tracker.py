@@ -45,7 +45,7 @@ class TrackingConfig:
     accept_misfit: float = 0.060  # m: a pose that fits worse is none
     stray_distance: float = 0.08  # m from the model, from which a point strays from it
     stray_share: float = 0.004  # of the points straying: a limb may be lost, and is sought elsewhere
-    doubt: float = 0.15  # of the points straying after that, from which all of the body is sought
+    doubt: float = 0.05  # of the points straying after that, from which all of the body is sought
     retry: float = 0.25  # s after a search that found nothing better, before the next one
     against: float = 1.75  # rad off the way somebody walks, from which the other way round is tried, too
     aside: float = 0.35  # rad off that way, from which a start faces it
