@@ -12,13 +12,11 @@ from torchpose.registration.fitting import PosePrior
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.limb_score import LimbScore
 from torchpose.registration.limb_search import LimbSearch
-from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
+from torchpose.registration.occlusion import OcclusionConfig
 from torchpose.registration.silhouette import RimConfig
 from torchpose.registration.vem import Distance, Registrar, RegistrationConfig
 
-ALONE = RegistrationConfig(
-    labelling=LabellingConfig(sweeps=0, potts=0.0), occlusion=OcclusionConfig(penalty=0.0)
-)
+ALONE = RegistrationConfig(labelling=LabellingConfig(sweeps=0, potts=0.0))
 F, R = 3, 60
 
 
@@ -42,12 +40,9 @@ def scene():
     return body, observation, pose, size, frame, limb, torch.rand(R, 1, generator=generator).double()
 
 
-def full(registrar, observation, pose, size, occlusion, share):
+def full(registrar, observation, pose, size, share):
     """Minus the log-density by the registrar, with a share of the pull to rest."""
     body = registrar.body
-    if occlusion.penalty > 0:
-        hidden = occlusion_potential(body(pose, size), observation.cloud.points, occlusion)
-        observation = replace(observation, potential=observation.potential + hidden)
     nothing = PosePrior(pose, torch.zeros_like(pose))
     bound = pose.new_zeros(1, len(pose))
     found = registrar.evaluate(observation, pose, size, nothing, bound, bound[0].long(), covariance=False)
@@ -73,15 +68,15 @@ def full(registrar, observation, pose, size, occlusion, share):
 def test_limbs_alone_have_the_score_of_whole_poses(scene, setting, noise, penalty, reach):
     body, observation, pose, size, frame, limb, way = scene
     observation = replace(observation, depth_noise=noise)
-    registrar, occlusion = Registrar(body, replace(ALONE, **setting)), OcclusionConfig(penalty=penalty)
+    registrar = Registrar(body, replace(ALONE, occlusion=OcclusionConfig(penalty=penalty), **setting))
     search = LimbSearch(body, registrar)
-    score = LimbScore(search, occlusion)
+    score = LimbScore(search)
     assert score.serves(registrar)
     own = search.limbs[limb]
     place = torch.lerp(pose[frame].gather(1, own), search.places[limb, torch.arange(R)], reach * way)
     quick = score(score.know(observation, pose, size), frame, limb, place, 0.3)
     moved = pose[frame].scatter(1, own, place)
-    slow = full(registrar, observation.share(frame), moved, size[frame], occlusion, 0.3)
+    slow = full(registrar, observation.share(frame), moved, size[frame], 0.3)
     assert_close(quick, slow, rtol=1e-9, atol=1e-7)
 
 
@@ -89,7 +84,7 @@ def test_a_frame_of_no_numbers_has_none_and_harms_no_other(scene):
     body, observation, pose, size, frame, limb, _ = scene
     registrar = Registrar(body, ALONE)
     search = LimbSearch(body, registrar)
-    score = LimbScore(search, OcclusionConfig())
+    score = LimbScore(search)
     points = observation.cloud.points.clone()
     points[1] = torch.nan
     broken = replace(observation, cloud=replace(observation.cloud, points=points))
@@ -101,7 +96,7 @@ def test_a_frame_of_no_numbers_has_none_and_harms_no_other(scene):
 
 def test_the_half_has_the_points_beside_the_limb(scene):
     body, observation, pose, size, frame, limb, _ = scene
-    score = LimbScore(LimbSearch(body, Registrar(body, ALONE)), OcclusionConfig())
+    score = LimbScore(LimbSearch(body, Registrar(body, ALONE)))
     rows = observation.share(frame)
     half = score.nearer_half(rows, pose[frame], size[frame], limb)
     centers = body(pose[frame], size[frame]).centers
@@ -122,7 +117,6 @@ def test_the_half_has_the_points_beside_the_limb(scene):
         {"hard": False},
         {"distance": Distance.algebraic},
         {"labelling": LabellingConfig(sweeps=1, potts=0.0)},
-        {"occlusion": OcclusionConfig()},
     ],
 )
 def test_other_labels_are_left_to_the_registrar(setting):

@@ -8,7 +8,7 @@ from synthetic_cloud import see, standing
 from torch.testing import assert_close
 
 from torchpose.body.model import BodyModel
-from torchpose.registration.occlusion import OcclusionConfig, depth_behind, occlusion_potential
+from torchpose.registration.occlusion import OcclusionConfig, depth_behind
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_a_seen_part_is_not_hidden_and_one_behind_the_trunk_is(scene):
     centers = posed.centers.clone()
     centers[:, hand] = centers[:, torso] * 1.1
     moved = replace(posed, centers=centers)
-    potential = occlusion_potential(moved, front, config)[0, 0]
+    potential = config.potential(depth_behind(moved, front))[0, :, 0]
     assert potential[hand] == -config.penalty
     assert potential[torso] == 0
 
@@ -54,10 +54,15 @@ def test_a_seen_part_is_not_hidden_and_one_behind_the_trunk_is(scene):
 def test_padding_gives_numbers(scene):
     _, posed, points = scene
     padded = torch.cat([points, torch.zeros_like(points[:, :2])], 1)
-    assert occlusion_potential(posed, padded, OcclusionConfig()).isfinite().all()
+    assert depth_behind(posed, padded).nan_to_num(neginf=0.0).isfinite().all()
 
 
 @pytest.mark.parametrize("setting", [{"penalty": -1.0}, {"margin": -0.1}, {"ramp": 0.0}])
 def test_bad_settings_are_told(setting):
     with pytest.raises(ValueError, match=r"penalty >= 0, margin >= 0 and ramp > 0 must hold, got"):
         OcclusionConfig(**setting)
+
+
+def test_a_term_of_no_rounds_is_told_how_to_switch_it_off():
+    with pytest.raises(ValueError, match="last_rounds must be at least 1, got 0; penalty=0 switches it off"):
+        OcclusionConfig(last_rounds=0)

@@ -134,7 +134,7 @@ def test_searches_leave_the_trunk():
         places = pose[:, search.limbs][:, :, None].clone()
         places[:, 0, 0] = place
         rest = search._rest_of_body(observation, pose, size)
-        score = LimbScore(search, OcclusionConfig(penalty=0.0))
+        score = LimbScore(search)
         known, zero = score.know(observation, pose, size), torch.zeros(1).long()
         totals.append(
             torch.stack(

@@ -14,7 +14,7 @@ from torchpose.body.ellipsoid import foot_of_part, rough_square
 from torchpose.body.model import PosedBody
 from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.limb_search import LEAST, LimbSearch
-from torchpose.registration.occlusion import OcclusionConfig, behind, entries
+from torchpose.registration.occlusion import behind, entries
 from torchpose.registration.silhouette import silhouette_residual
 from torchpose.registration.solid import parts_of, solid_residual
 from torchpose.registration.start import picked
@@ -44,9 +44,9 @@ class LimbScore(nn.Module):
     limbs: Tensor  # as the search has them
     parts: Tensor
 
-    def __init__(self, search: LimbSearch, occlusion: OcclusionConfig):
+    def __init__(self, search: LimbSearch):
         super().__init__()
-        self.body, self.registrar, self.occlusion = search.body, search.registrar, occlusion
+        self.body, self.registrar = search.body, search.registrar
         self.register_buffer("limbs", search.limbs, persistent=False)
         self.register_buffer("parts", search.parts, persistent=False)
 
@@ -54,7 +54,7 @@ class LimbScore(nn.Module):
     def serves(registrar: Registrar) -> bool:
         """Whether the registrar judges points as it is done here."""
         config = registrar.config
-        alone = config.labelling.sweeps == 0 and config.labelling.potts == 0 and config.occlusion.penalty == 0
+        alone = config.labelling.sweeps == 0 and config.labelling.potts == 0
         return alone and config.hard and config.distance is Distance.euclidean
 
     def know(
@@ -132,10 +132,10 @@ class LimbScore(nn.Module):
         exact = torch.where(among[:, :few], known.near_potential[frame, limb], potential.gather(1, near))
         potential.scatter_(1, near, exact)
         potential[at] = appearance[at] - square / (2 * config.sigma_last**2)
-        if self.occlusion.penalty > 0:
+        if config.occlusion.penalty > 0:
             enters, front = known.enters[frame], known.front[frame]
             enters[at], front[at] = entries(posed, points)
-            potential = potential + self.occlusion.potential(behind(enters, front))
+            potential = potential + config.occlusion.potential(behind(enters, front))
         none = -0.5 * config.outlier**2 if config.outlier > 0 else -torch.inf
         best = potential.amax(1, keepdim=True)
         most = best.clamp_min(none)

@@ -17,13 +17,18 @@ class OcclusionConfig:
     penalty: float = 5.0  # nats against a part that another one hides; 0 switches the term off
     margin: float = 0.02  # m behind the other one's surface, from which it counts
     ramp: float = 0.03  # m more, at which it counts in full: bodies are not quite ellipsoids
+    last_rounds: int = 2  # of a fit in which it counts: far from the answer limbs hide what they should not
 
     def __post_init__(self) -> None:
+        if self.last_rounds < 1:
+            raise ValueError(
+                f"last_rounds must be at least 1, got {self.last_rounds}; penalty=0 switches it off"
+            )
         if self.penalty < 0 or self.margin < 0 or not self.ramp > 0:
             raise ValueError(f"penalty >= 0, margin >= 0 and ramp > 0 must hold, got {self}")
 
     def potential(self, behind: Float[Tensor, "batch parts num"]) -> Float[Tensor, "batch parts num"]:
-        """Log-potentials of parts that lie so far behind others, m."""
+        """Log-potentials of parts that lie so far behind others, m: minus the penalty where hidden, 0 where not."""
         return -self.penalty * ((behind - self.margin) / self.ramp).clamp(0, 1)
 
 
@@ -70,10 +75,3 @@ def entries(
     b = toward[..., 0] @ ray.mT
     enters = (b - root.clamp_min(0).sqrt()) / a
     return enters, torch.where(root > 0, enters, torch.inf)
-
-
-def occlusion_potential(
-    posed: PosedBody, points: Float[Tensor, "batch num 3"], config: OcclusionConfig
-) -> Float[Tensor, "batch num parts"]:
-    """Log-potentials of the parts: minus the penalty where they are hidden, 0 where they are not."""
-    return config.potential(depth_behind(posed, points)).mT

@@ -36,7 +36,7 @@ from torchpose.registration.fitting import (
     pose_terms,
 )
 from torchpose.registration.labelling import GeodesicTerm, Labelling, LabellingConfig, mean_field
-from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
+from torchpose.registration.occlusion import OcclusionConfig, depth_behind
 from torchpose.registration.silhouette import RimConfig, overhang_of, silhouette_residual, silhouette_rows
 from torchpose.registration.solid import SolidConfig, parts_of, solid_residual, solid_rows
 from torchpose.vision.camera import StereoCamera
@@ -307,7 +307,8 @@ class Registrar(nn.Module):
             share = i / max(rounds - 1, 1)
             sigma = sigma_first ** (1 - share) * config.sigma_last**share
             foot = self.correspond(posed, observation)
-            labelling = self.label(posed, foot, observation, sigma)
+            occlude = i >= rounds - config.occlusion.last_rounds
+            labelling = self.label(posed, foot, observation, sigma, occlude)
             bounds.append(labelling.bound[-1])
             rim = i >= rounds - config.rim.last_rounds
             rows, support = self.rows(posed, foot, labelling, observation, rim)
@@ -359,13 +360,25 @@ class Registrar(nn.Module):
         return self.config.ray_sd / noise.clamp_min(self.config.ray_sd)
 
     def label(
-        self, posed: PosedBody, foot: Correspondence, observation: Observation, sigma: float
+        self,
+        posed: PosedBody,
+        foot: Correspondence,
+        observation: Observation,
+        sigma: float,
+        occlude: bool = True,
     ) -> Labelling:
-        """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled."""
+        """The VE-step at one pose: beliefs over the parts, and "no part" last if outliers are modelled.
+
+        With `occlude`, parts that the body hides are not believed to have given points.
+        """
         square = foot.square
         if self.config.distance is Distance.algebraic:
             square = algebraic_distance(posed, observation.cloud.points).square()
         potential = observation.potential.mT - square / (2 * sigma**2)
+        if occlude and self.config.occlusion.penalty > 0:
+            potential = potential + self.config.occlusion.potential(
+                depth_behind(posed, observation.cloud.points)
+            )
         if self.config.outlier > 0:
             none = torch.full_like(potential[:, :1], -0.5 * self.config.outlier**2)
             potential = torch.cat([potential, none], 1)
@@ -508,11 +521,6 @@ class Registrar(nn.Module):
         cloud = observation.cloud
         posed = self.body(pose, size) if posed is None else posed
         foot = self.correspond(posed, observation)
-        if observation.depth_noise > 0 and config.occlusion.penalty > 0:
-            # Where distances along the ray hardly count, a body with left and right exchanged fits as well, half of it
-            # behind the other half: what hides what tells the two apart.
-            hidden = occlusion_potential(posed, cloud.points, config.occlusion)
-            observation = replace(observation, potential=observation.potential + hidden)
         labelling = self.label(posed, foot, observation, config.sigma_last)
         doubt = pose.new_tensor(torch.nan).expand(*pose.shape, pose.shape[1])
         if covariance:

@@ -12,12 +12,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.body.model import BodyModel, PosedBody
+from torchpose.body.model import BodyModel
 from torchpose.registration.fitting import PosePrior, pose_terms
 from torchpose.registration.labelling import LabellingConfig
 from torchpose.registration.limb_score import KnownBody, LimbScore
 from torchpose.registration.limb_search import LimbSearch, LimbSearchConfig
-from torchpose.registration.occlusion import OcclusionConfig, occlusion_potential
 from torchpose.registration.start import thin
 from torchpose.registration.vem import Observation, Registrar, Registration
 from torchpose.tracking.trellis import best_sequence, spread, step_cost, weights
@@ -41,7 +40,6 @@ class HypothesisConfig:
     sigma: float = 0.05  # m, in the first of them
     reach: tuple[int, ...] = (1, 2, 4, 8)  # frames, to either side, from which places are tried
     limbs: LimbSearchConfig = field(default_factory=LimbSearchConfig)
-    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
 
     def __post_init__(self) -> None:
         if self.sweeps < 0:
@@ -100,13 +98,11 @@ class LimbHypotheses(nn.Module):
         super().__init__()
         self.body, self.config = body, config
         alone = LabellingConfig(sweeps=0, potts=0.0)
-        # What is hidden is among the observation's own potentials, see `seen`.
-        nothing = OcclusionConfig(penalty=0.0)
-        self.registrar = Registrar(body, replace(registrar.config, labelling=alone, occlusion=nothing))
+        self.registrar = Registrar(body, replace(registrar.config, labelling=alone))
         self.search = LimbSearch(body, self.registrar, config.limbs)
         effective = registrar.config.effective_points / 2  # see `nearer_half`
         self.fitter = Registrar(body, replace(self.registrar.config, effective_points=effective))
-        self.score = LimbScore(self.search, config.occlusion)
+        self.score = LimbScore(self.search)
 
     def forward(
         self,
@@ -201,15 +197,10 @@ class _Work:
             nothing = PosePrior(p, torch.zeros_like(p))
             bound = p.new_zeros(1, len(p))
             found = registrar.evaluate(
-                self.seen(t, p), p, self.size[t], nothing, bound, bound[0].long(), covariance=False
+                self.observation.share(t), p, self.size[t], nothing, bound, bound[0].long(), covariance=False
             )
             out.append(self._score(found))
         return torch.cat(out) if out else pose.new_zeros(0)
-
-    def seen(self, frame: Tensor, pose: Tensor) -> Observation:
-        """Frames, whose points are not of parts that are hidden at these poses."""
-        posed = self.of.body(pose, self.size[frame])
-        return unoccluded(self.observation.share(frame), posed, self.of.config.occlusion)
 
     def _score(self, found: Registration) -> Tensor:
         K = self.of.body.num_parts
@@ -306,7 +297,6 @@ class _Work:
         ):
             hold = torch.full_like(p, HELD).scatter(1, self.limbs[k], 0.0)
             half = self.of.score.nearer_half(self.observation.share(t), p, self.size[t], k)
-            half = unoccluded(half, self.of.body(p, self.size[t]), config.occlusion)
             found, _, _ = self.of.fitter.approach(
                 half, p, self.size[t], PosePrior(p, hold), config.rounds, config.sigma
             )
@@ -326,11 +316,3 @@ def _sound(cost: Tensor) -> Tensor:
     """A frame without a finite cost for its first hypothesis says nothing."""
     broken = ~cost[..., :1].isfinite()
     return torch.where(broken, 0.0, torch.where(cost.isfinite(), cost, torch.inf))
-
-
-def unoccluded(observation: Observation, posed: PosedBody, config: OcclusionConfig) -> Observation:
-    """The observation with what the posed body hides of itself among its potentials."""
-    if config.penalty == 0:
-        return observation
-    hidden = occlusion_potential(posed, observation.cloud.points, config)
-    return replace(observation, potential=observation.potential + hidden)

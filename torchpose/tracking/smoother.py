@@ -18,7 +18,7 @@ from torchpose.registration.start import turned_by
 from torchpose.registration.vem import Observation, Registrar, Registration, is_finite
 from torchpose.registration.walk import WalkConfig, backwards_cost, walking_yaw
 from torchpose.tracking.chain import FLOOR, Chain, fit_chain, solve_chain
-from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses, unoccluded
+from torchpose.tracking.limb_hypothesis import HypothesisConfig, LimbHypotheses
 
 ANGLES = slice(3, 6)  # of the root, which come round again
 MOST = 48  # rows registered at once: more are no faster
@@ -212,7 +212,6 @@ class Smoother(nn.Module):
         registrar = self.registrar
         posed = self.body(pose, size)
         foot = registrar.correspond(posed, observation)
-        observation = unoccluded(observation, posed, self.config.hypotheses.occlusion)
         labelling = registrar.label(posed, foot, observation, registrar.config.sigma_last)
         rows, support = registrar.rows(posed, foot, labelling, observation, tangential=tangential)
         rest = registrar.with_rest(PosePrior(pose, torch.zeros_like(pose)), support)
