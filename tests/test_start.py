@@ -375,12 +375,15 @@ def test_the_best_few_that_differ_are_those_taken_one_after_another(body):
     rank[4] = torch.inf  # and in the last frame none
     pose = torch.zeros(5, 9, 24)
     pose[..., 6:] = 0.3 * torch.randint(3, (5, 9, 18), generator=generator) * (torch.arange(18) == 7)
-    pose[..., :6] = torch.randn(5, 9, 6, generator=generator)  # the root tells none apart
+    pose[..., :3] = torch.randn(5, 9, 3, generator=generator)  # the place tells none apart,
+    pose[..., 3] = 2 * torch.pi * torch.randint(-1, 2, (5, 9), generator=generator)  # and no whole turn,
+    pose[1, ::2, 3] += torch.pi  # but the way that somebody faces
     best, there = starter._different(rank, pose)
     for b in range(4):
         taken = []
         for k in rank[b].argsort().tolist():
-            new = all(bool((pose[b, k, 6:] - pose[b, j, 6:]).abs().max() >= 0.2) for j in taken)
+            turns = [(pose[b, k, 3:] - pose[b, j, 3:]) / (2 * torch.pi) for j in taken]
+            new = all(bool((turn - turn.round()).abs().max() >= 0.2 / (2 * torch.pi)) for turn in turns)
             if new and rank[b, k] < torch.inf and len(taken) < 3:
                 taken.append(k)
         assert best[b, there[b]].tolist() == taken
@@ -400,7 +403,7 @@ def test_finalists_are_different_poses(body, starter, monkeypatch):
     pose = standing(body, limbs(body, **WAVE))
     starter.refresh(see(body, pose, num=200).observation(), standing(body), body.default_size(1))
     (finalists,) = fitted
-    gaps = (finalists[:, None, 6:] - finalists[:, 6:]).abs().amax(2)
+    gaps = (finalists[:, None, 3:] - finalists[:, 3:]).abs().amax(2)
     assert 1 < len(finalists) <= starter.config.finalists
     assert (gaps + torch.eye(len(gaps)) >= starter.config.finalists_apart).all()
 

@@ -50,7 +50,9 @@ class StartConfig:
     rounds: int = 5  # of these starts
     final_rounds: int = 8  # of the best few, on all points
     finalists: int = 4
-    finalists_apart: float = 0.25  # rad by which these differ in a joint: the same one four times is only one
+    finalists_apart: float = (
+        0.25  # rad by which these differ in an angle: the same one four times is only one
+    )
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
     exchanged: int = 8  # best starts whose limbs are exchanged
     apart: float = 0.03  # rad by which limbs differ that are exchanged: the others end in the same place
@@ -190,14 +192,15 @@ class Starter(nn.Module):
     def _different(
         self, rank: Float[Tensor, "batch poses"], pose: Float[Tensor, "batch poses parameters"]
     ) -> tuple[Int[Tensor, "batch best"], Bool[Tensor, "batch best"]]:
-        """The best few poses of each frame that differ in a joint, the least rank first; and which of these exist."""
-        joints, best, there = pose[..., 6:], [], []
+        """The best few poses of each frame that differ in an angle, the least rank first; and which of these exist."""
+        angles, best, there = pose[..., 3:], [], []  # of the root, too: somebody may face either way
         for _ in range(min(self.config.finalists, rank.shape[1])):
             least, which = rank.min(1, keepdim=True)
             best.append(which)
             there.append(least < torch.inf)
-            one = joints.gather(1, which[..., None].expand(-1, -1, joints.shape[2]))
-            near = (joints - one).abs().amax(2) < self.config.finalists_apart
+            one = angles.gather(1, which[..., None].expand(-1, -1, angles.shape[2]))
+            gap = torch.remainder(angles - one + pi, 2 * pi) - pi
+            near = gap.abs().amax(2) < self.config.finalists_apart
             rank = torch.where(near, torch.inf, rank).scatter(1, which, torch.inf)
         # Of a frame of no numbers one is as good as another, and one must be answered.
         there[0] = torch.ones_like(there[0])
