@@ -50,9 +50,7 @@ class StartConfig:
     rounds: int = 5  # of these starts
     final_rounds: int = 8  # of the best few, on all points
     finalists: int = 4
-    finalists_apart: float = (
-        0.25  # rad by which these differ in an angle: the same one four times is only one
-    )
+    finalists_apart: float = 0.25  # rad by which these differ in an angle: one pose four times is one
     sigma: float = 0.15  # m, in the first round: a cold start is decimetres off
     exchanged: int = 8  # best starts whose limbs are exchanged
     apart: float = 0.03  # rad by which limbs differ that are exchanged: the others end in the same place
@@ -163,7 +161,7 @@ class Starter(nn.Module):
         walking: float | None = None,
     ) -> Registration:
         """Every start of each frame is fitted on a few points, the limbs of the good ones are exchanged, and the best
-        few combinations are fitted on all points. Of each frame the registration with the least misfit is returned."""
+        few that differ are fitted on all points. Of each frame the registration with the least score is returned."""
         few, (B, S, P) = thin(observation, self.config.points), starts.shape
         row = torch.arange(B, device=starts.device)
         every = row.repeat_interleave(S)
